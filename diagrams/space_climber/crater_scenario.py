@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
+import casadi
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -14,10 +15,13 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus
 
 from vtbdrake.common.settings import setting
+from vtbdrake.compiled import At, Equations
+from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.packed_system import Expression
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
@@ -145,7 +149,11 @@ class CraterScenario(SpaceClimberScenario):
             self,
             simulator_config=SimulatorConfig(),
             plant_config=MultibodyPlantConfig(
-                time_step=self.period, contact_model="point", discrete_contact_approximation="sap"
+                time_step=self.period,
+                contact_model="point",
+                discrete_contact_approximation="sap",
+                # The contact switches see the present state, as they do in the world: not the step before.
+                use_sampled_output_ports=False,
             ),
             waviness=0.0,
         )
@@ -215,6 +223,11 @@ class EndOfClimb(AddressedSystem):
         name: EndOfClimb
         input_ports:
         - body_poses
+
+    Attributes:
+        base: Index of the robot's torso in the plant.
+        checks: The number of checks without progress after which a robot is stuck; 0: it never is.
+        progress: The state: the largest distance from the axis (m), and the checks since it was reached.
     """
 
     def __init__(self, base: BodyIndex, *, period: float, patience: float = 0.0) -> None:
@@ -227,25 +240,71 @@ class EndOfClimb(AddressedSystem):
                 0: it never is.
         """
         super().__init__()
-        self._base = int(base)
-        self._checks = patience / period
+        self.base = int(base)
+        self.checks = patience / period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
-        self._progress = self.declare_discrete_state(farthest=Quantity(0.0, "m"), checks_since=Quantity(0.0))
+        self.progress = self.declare_discrete_state(farthest=Quantity(0.0, "m"), checks_since=Quantity(0.0))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
 
     def _check(self, context: Context, state: DiscreteValues) -> EventStatus:
-        X_WB = self._poses.Eval(context)[self._base]
+        X_WB = self._poses.Eval(context)[self.base]
         distance = np.hypot(*X_WB.translation()[:2])
         if distance > RIM_RADIUS + PAST_RIM:
             return EventStatus.ReachedTermination(self, PASSED)
         rotation = X_WB.rotation().ToRollPitchYaw()
         if max(abs(rotation.roll_angle()), abs(rotation.pitch_angle())) > TIPPED_OVER:
             return EventStatus.ReachedTermination(self, TIPPED)
-        progress = self._progress.mutable(state)
+        progress = self.progress.mutable(state)
         if distance > progress.farthest + PROGRESS:
             progress.farthest, progress.checks_since = distance, 0.0
         else:
             progress.checks_since += 1.0
-            if self._checks and progress.checks_since >= self._checks:
+            if self.checks and progress.checks_since >= self.checks:
                 return EventStatus.ReachedTermination(self, STUCK)
         return EventStatus.Succeeded()
+
+    def compiled_equations(self, context: Context, varied: frozenset[str]) -> EndOfClimbEquations:
+        """Return the equations for compiled testbeds.
+
+        Args:
+            context: The system's own context.
+            varied: Names of its variables that will be varied.
+        """
+        return EndOfClimbEquations(self, context, varied)
+
+
+class EndOfClimbEquations(Equations):
+    """An `EndOfClimb`."""
+
+    endings = ENDS
+
+    def output(self, port: str, at: At) -> Expression:
+        raise ValueError(f"EndOfClimb has no output port {port!r}")
+
+    def update(self, at: At) -> dict[int, Expression]:
+        return {int(self._climb.progress.index): self._check(at)[0]}
+
+    def ending(self, at: At) -> Expression:
+        return self._check(at)[1]
+
+    @property
+    def _climb(self) -> EndOfClimb:
+        system: Any = self.system
+        return system
+
+    def _check(self, at: At) -> tuple[Expression, Expression]:
+        """Return the next state, and the number of the ending."""
+        R, p = at.input("body_poses")(self._climb.base)
+        state = at.state(int(self._climb.progress.index))
+        farthest, checks_since = state[0], state[1]
+        distance = casadi.norm_2(p[:2])
+        rpy = roll_pitch_yaw_angles(R)
+        passed = distance > RIM_RADIUS + PAST_RIM
+        tipped = casadi.fmax(casadi.fabs(rpy[0]), casadi.fabs(rpy[1])) > TIPPED_OVER
+        advances = distance > farthest + PROGRESS
+        count = casadi.if_else(advances, 0.0, checks_since + 1.0)
+        stuck = casadi.logic_and(count > 0.0, count >= self._climb.checks) if self._climb.checks else casadi.SX(0)
+        ending = casadi.if_else(passed, 1, casadi.if_else(tipped, 2, casadi.if_else(stuck, 3, 0)))
+        following = casadi.vertcat(casadi.if_else(advances, distance, farthest), count)
+        ends_early = casadi.logic_or(passed, tipped)
+        return casadi.if_else(ends_early, state, following), ending

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import pi
 from types import SimpleNamespace
+from typing import Any
 
 import casadi
 import numpy as np
@@ -14,6 +15,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiscreteValues, System
 
+from vtbdrake.compiled import At, SensorEquations
 from vtbdrake.components.casadi_system import clamp
 from vtbdrake.components.sensors import ErrorModel, SampledSensor
 from vtbdrake.state import NamedVector, Quantity
@@ -56,22 +58,48 @@ class VisualOdometer(SampledSensor):
             noise={"noise": (3, "m/s")},
             errors=errors,
         )
-        self._body = int(body)
+        self.body = int(body)
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         # Whether there was a sample, and the position at it.
-        self._memory = self.declare_discrete_state(
-            known=Quantity(0.0, bounds=(0.0, 1.0)), last_position=Quantity(np.zeros(3), "m")
+        self.memory = self.declare_discrete_state(
+            sampled=Quantity(0.0, bounds=(0.0, 1.0)), last_position=Quantity(np.zeros(3), "m")
         )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        X_WB = self._poses.Eval(context)[self._body]
-        last, following = self._memory.view(context), self._memory.mutable(state)
-        following.known, following.last_position = 1.0, X_WB.translation()
-        if not last.known:
+        X_WB = self._poses.Eval(context)[self.body]
+        last, following = self.memory.view(context), self.memory.mutable(state)
+        following.sampled, following.last_position = 1.0, X_WB.translation()
+        if not last.sampled:
             return np.zeros(3)
         displacement = X_WB.translation() - last.last_position
         velocity: NDArray[np.float64] = X_WB.rotation().inverse() @ (displacement / self.period)
         return velocity
+
+    def compiled_equations(self, context: Context, varied: frozenset[str]) -> VisualOdometerEquations:
+        """Return the equations for compiled testbeds.
+
+        Args:
+            context: The sensor's own context.
+            varied: Names of its variables that will be varied.
+        """
+        return VisualOdometerEquations(self, context, varied)
+
+
+class VisualOdometerEquations(SensorEquations):
+    """A `VisualOdometer`."""
+
+    def __init__(self, system: VisualOdometer, context: Context, varied: frozenset[str]) -> None:
+        def velocity(at: At) -> Expression:
+            R, p = at.input("body_poses")(system.body)
+            last = at.state(int(system.memory.index))
+            return casadi.if_else(last[0] != 0.0, R.T @ ((p - last[1:]) / system.period), casadi.SX.zeros(3, 1))
+
+        super().__init__(system, context, varied, velocity)
+
+    def update(self, at: At) -> dict[int, Expression]:
+        system: Any = self.system
+        _, p = at.input("body_poses")(system.body)
+        return {**super().update(at), int(system.memory.index): casadi.vertcat(1.0, p)}
 
 
 def make_navigator(*, period: float) -> System:

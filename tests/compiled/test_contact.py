@@ -73,7 +73,7 @@ class Steps:
             casadi.vertcat(*(distance for _, _, distance in touching)),
         ]
         options = {"cse": True}
-        self._step = casadi.Function("step", [q, v, u], [casadi.densify(part) for part in step], options)
+        self._step = casadi.Function("step", [q, v, u], [casadi.densify(part) for part in step[:4]], options)
         self._parts = casadi.Function("parts", [q, v, u], [casadi.densify(part) for part in parts], options)
 
     def randomize(self, random: np.random.Generator) -> None:

@@ -2,6 +2,7 @@
 
 from vtbdrake.compiled.agreement import CompiledDifferenceError
 from vtbdrake.compiled.compiled_rollouts import CompiledBatch, CompiledRollouts
+from vtbdrake.compiled.components import SensorEquations
 from vtbdrake.compiled.equations import At, Draw, Equations, Fixed, Timing, UnsupportedTestbedError
 from vtbdrake.compiled.registry import EQUATIONS
 from vtbdrake.components.casadi_system.compiler import CompilerError
@@ -16,6 +17,7 @@ __all__ = [
     "Draw",
     "Equations",
     "Fixed",
+    "SensorEquations",
     "Timing",
     "UnsupportedTestbedError",
 ]

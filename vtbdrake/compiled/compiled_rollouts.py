@@ -56,6 +56,10 @@ class CompiledBatch:
         valid: Mask of the rollouts that equal the Diagram's, shape (n,): all state is finite all the time, and each
             step of a plant has converged, also in what is recorded at the samples.
         reasons: Why and at which time a rollout ceased to equal the Diagram's; empty for those that are valid.
+        ends: The times from the begin at which a system has ended the simulation, shape (n,), in seconds; else inf.
+        counts: The number of samples of each rollout, shape (n,). Where a system has ended it, the last one is the
+            state at that time, and later rows of the outputs repeat it.
+        messages: What Drake's Simulator tells about the end; empty where no system has ended the simulation.
     """
 
     times: Array
@@ -63,6 +67,9 @@ class CompiledBatch:
     final: Array
     valid: NDArray[np.bool_]
     reasons: tuple[str, ...]
+    ends: Array
+    counts: NDArray[np.intp]
+    messages: tuple[str, ...]
 
 
 class CompiledRollouts:
@@ -264,7 +271,13 @@ class CompiledRollouts:
             for name, columns in self.columns.items()
         }
         valid: NDArray[np.bool_] = np.all(~doubted, axis=1)
-        return CompiledBatch(self.times, outputs, final, valid, reasons)
+        ends, messages = final[:, -4], tuple(self.walker.message(*row[::-1]) for row in final[:, -4:-2].tolist())
+        has_ended = final[:, -3] > 0.0
+        instants_of_samples = [instant.time for instant in instants if instant.is_sample]
+        before = np.searchsorted(instants_of_samples, ends, side="right")
+        counts = np.where(has_ended, before + 1, len(self.times))
+        ends = np.where(has_ended, ends - t0, inf)
+        return CompiledBatch(self.times, outputs, final, valid, reasons, ends, counts, messages)
 
     def expressions(self, values: Mapping[str, Any]) -> dict[str, casadi.MX]:
         """Return the outputs of one rollout as expressions, for CasADi's solvers and its derivatives.
@@ -405,7 +418,7 @@ class CompiledRollouts:
             # Rollouts of this length that begin at other times may have some more.
             count = needed + len(self.walker.timings)
             unrestricted = [timing.unrestricted for timing in self.walker.timings]
-            function = _rollout(self.updates, unrestricted, self.record, count)
+            function = _rollout(self.updates, unrestricted, self.record, count, may_end=bool(self.walker.endings))
             program = Program(function, count, self._translate)
             self._programs.add(count, program)
             return program
@@ -527,7 +540,12 @@ def _refuse_many_instants(horizon: float, sample_period: float, periods: Sequenc
 
 
 def _rollout(
-    updates: Sequence[casadi.Function], unrestricted: Sequence[bool], record: casadi.Function, count: int
+    updates: Sequence[casadi.Function],
+    unrestricted: Sequence[bool],
+    record: casadi.Function,
+    count: int,
+    *,
+    may_end: bool,
 ) -> casadi.Function:
     """Return the function (z, instants, w) -> (z, recorded) of ``count`` instants.
 
@@ -539,6 +557,7 @@ def _rollout(
         unrestricted: Whether each of them is an unrestricted update.
         record: The function (z, time, w) of what is recorded.
         count: The number of instants.
+        may_end: Whether a system may end the simulation: nothing is updated after that, and samples are of its end.
     """
     z, time, w = record.sx_in()
     nothing = casadi.Function("nothing", [z, time, w], [casadi.SX.zeros(record.numel_out(0), 1)])
@@ -546,7 +565,7 @@ def _rollout(
     begin, instant, random = (
         casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 2 + len(updates)), ("w", w.numel()))
     )
-    state = begin
+    state, has_ended = begin, begin[-3] > 0.0
     for kind in (True, False):
         before = state
         for k, update in enumerate(updates):
@@ -554,8 +573,10 @@ def _rollout(
                 other = casadi.SX.sym("before", z.numel())
                 keep = casadi.Function(f"keep_{k}", [other, z, time, w], [z])
                 if_due = casadi.Function.if_else(f"due_{k}", update, keep)
-                state = if_due(instant[2 + k], before, state, instant[0], random)
-    recorded = sample(instant[1], begin, instant[0], random)
+                is_due = casadi.if_else(has_ended, 0.0, instant[2 + k]) if may_end else instant[2 + k]
+                state = if_due(is_due, before, state, instant[0], random)
+    when = casadi.if_else(has_ended, begin[-4], instant[0]) if may_end else instant[0]
+    recorded = sample(instant[1], begin, when, random)
     return _repeated(casadi.Function("step", [begin, instant, random], [state, recorded]), count)
 
 

@@ -13,11 +13,14 @@ from pydrake.systems.framework import Context, System
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Fixed, Timing, refusal
 from vtbdrake.components.casadi_system.function_ports import INPUT, PARAMETER, STATE, FunctionResult, Model
+from vtbdrake.components.casadi_system.rotations import quaternion, rotation_matrix
 from vtbdrake.components.sensors import errors as sensor_errors
 from vtbdrake.components.sensors.noise import noise_of_seeds
 
 # As a SplineCommand rounds.
 _ROUNDING = 1e-9
+# An Imu takes a turn between two samples for 0 whose half has a smaller sine.
+_SMALLEST_SINE = 1e-12
 
 
 class CasadiEquations(Equations):
@@ -213,6 +216,68 @@ class JointSensorEquations(SensorEquations):
     def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
         entries = system.entries.tolist()
         super().__init__(system, context, varied, lambda at: at.input("state")[entries])
+
+
+class ImuEquations(SensorEquations):
+    """An `Imu`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied, lambda at: self._sample(at)[0])
+
+    def update(self, at: At) -> dict[int, Expression]:
+        system: Any = self.system
+        return {**super().update(at), int(system.memory.index): self._sample(at)[1]}
+
+    def _sample(self, at: At) -> tuple[Expression, Expression]:
+        return at.shared("sample", lambda: self._new_sample(at))
+
+    def _new_sample(self, at: At) -> tuple[Expression, Expression]:
+        """Return the measurement and the memory of it."""
+        system: Any = self.system
+        mount = at.parameter(int(system.settings.index))[system.settings.vector.slice_of("mount")]
+        memory = at.state(int(system.memory.index))
+        sampled, last_v, last_q = memory[0], memory[1:4], memory[4:]
+        q_WB, w_WB, v_WB = self._motion(at)
+        R_WB = rotation_matrix(q_WB)
+        v_WF = v_WB + casadi.cross(w_WB, R_WB @ mount[:3])
+        q_WF = _product(q_WB, _quaternion_of_roll_pitch_yaw(mount[3:]))
+        at_rest = -rotation_matrix(q_WF).T @ casadi.DM(system.gravity)
+        force = (v_WF - last_v) / system.period - casadi.DM(system.gravity)
+        # q and -q are the same orientation.
+        last_q = casadi.if_else(casadi.dot(last_q, q_WF) < 0.0, -last_q, last_q)
+        turn = _product(casadi.vertcat(last_q[0], -last_q[1:]), q_WF)
+        sine = casadi.norm_2(turn[1:])
+        angle = casadi.if_else(sine > _SMALLEST_SINE, 2.0 * casadi.atan2(sine, turn[0]) / sine, 2.0)
+        middle = last_q + q_WF
+        R_mid = rotation_matrix(middle / casadi.norm_2(middle))
+        moving = casadi.vertcat(angle / system.period * turn[1:], R_mid.T @ force)
+        reading = casadi.if_else(sampled != 0.0, moving, casadi.vertcat(casadi.SX.zeros(3, 1), at_rest))
+        return reading, casadi.vertcat(1.0, v_WF, q_WF)
+
+    def _motion(self, at: At) -> tuple[Expression, Expression, Expression]:
+        """Return q_WB (wxyz), w_WB and v_WB."""
+        system: Any = self.system
+        if system.floating_places is None:
+            R, _ = at.input("body_poses")(system.body)
+            V = at.input("body_spatial_velocities")(system.body)
+            return quaternion(R), V[:3], V[3:]
+        x, (orientation, velocity) = at.input("state"), system.floating_places
+        q = x[orientation : orientation + 4]
+        return q / casadi.norm_2(q), x[velocity : velocity + 3], x[velocity + 3 : velocity + 6]
+
+
+def _quaternion_of_roll_pitch_yaw(rpy: Expression) -> Expression:
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), (4, 1)."""
+    c, s = casadi.cos(rpy / 2), casadi.sin(rpy / 2)
+    x, y, z = (casadi.vertcat(c[k], *(s[k] if axis == k else casadi.SX(0) for axis in range(3))) for k in range(3))
+    return _product(z, _product(y, x))
+
+
+def _product(a: Expression, b: Expression) -> Expression:
+    """Return the product of two quaternions, (4, 1)."""
+    return casadi.vertcat(
+        a[0] * b[0] - casadi.dot(a[1:], b[1:]), a[0] * b[1:] + b[0] * a[1:] + casadi.cross(a[1:], b[1:])
+    )
 
 
 class JointTorqueEquations(SensorEquations):

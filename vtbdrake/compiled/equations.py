@@ -133,12 +133,14 @@ class Equations(ABC):
         draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
         may_be_infinite: Whether its discrete state may be infinite or NaN in a valid rollout.
         doubtful: What is wrong where `doubt` is positive, as a sentence.
+        endings: The messages with which the updates may end a simulation, see `ending`.
         agreement: The largest difference from the system's own state after one step, relative to the largest entry of
             its state, or to 1: what rounding makes, or where an iteration ends.
     """
 
     may_be_infinite = False
     doubtful = "its equations do not hold"
+    endings: tuple[str, ...] = ()
     agreement = 1e-11
     extras: dict[str, int]
     draws: dict[str, Draw]
@@ -188,6 +190,14 @@ class Equations(ABC):
             at: Inputs, state and parameters at this instant, after all its outputs and updates have been written.
         """
         return None
+
+    def ending(self, at: At) -> Expression:
+        """Return the number in `endings`, from 1 on, with which the update ends the simulation; 0: it goes on.
+
+        Args:
+            at: Inputs, state and parameters at the instant of the update.
+        """
+        return casadi.SX(0)
 
     def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int, Expression]]]]:
         """Yield when the system is updated, and how; a system with updates at several timings has several."""

@@ -16,7 +16,8 @@ from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refus
 from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
-from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
+from vtbdrake.components.compiled_plant.contact import Contacts, PointContact, contact_pairs
+from vtbdrake.components.compiled_plant.ground import SLOTS
 from vtbdrake.components.compiled_plant.sap import Drive, SapSolver, stops
 from vtbdrake.state.multibody import POSE_ENTRIES, bodies, element_address, multibody_variables
 from vtbdrake.state.variables import A, Variable
@@ -50,6 +51,7 @@ class _Step(NamedTuple):
         forces: The contact forces, see `SapSolver.step`.
         efforts: The actuation of the drives.
         doubt: Positive where the solver has not converged.
+        contacts: The contacts of the step; None without a solver.
     """
 
     q: Expression
@@ -59,6 +61,7 @@ class _Step(NamedTuple):
     forces: Expression
     efforts: Expression
     doubt: Expression
+    contacts: Contacts | None
 
 
 class PlantEquations(Equations):
@@ -86,9 +89,15 @@ class PlantEquations(Equations):
             self._model = PlantDynamics(system, bare, inputs=sorted(varied & self._inputs.keys()), controllers=True)
         with _noted(reasons):
             pairs = contact_pairs(system, context)
+            self._has_contact = bool(pairs)
         if reasons:
             raise refusal(system, f"is refused: {'; '.join(reasons)}")
-        self._contact = PointContact(system, self._model, pairs)
+        try:
+            self._contact = PointContact(system, self._model, pairs)
+        except CompilerError as error:
+            raise refusal(system, f"has contact, which is written in C: {error}") from None
+        if self._contact.grounds:
+            self.doubtful += f", or a sphere touches more than {SLOTS} pieces of ground"
         self._drives = _drives(system, context)
         self._solver = self._new_solver()
         self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
@@ -96,7 +105,7 @@ class PlantEquations(Equations):
 
     def _new_solver(self) -> SapSolver | None:
         """Return the solver, or None if the plant has nothing that needs it, or stops alone but no C compiler."""
-        pairs, drives = self._contact.pairs, self._drives
+        pairs, drives = self._has_contact, self._drives
         if not (pairs or drives or stops(self._plant)):
             return None
         try:
@@ -131,6 +140,10 @@ class PlantEquations(Equations):
             return self._contact_load(at)
         if port.endswith("net_actuation"):
             return self._net_actuation(port, at)
+        if port == "body_poses":
+            return lambda body: self._of_body(body, at)[0]
+        if port == "body_spatial_velocities":
+            return lambda body: self._of_body(body, at)[1]
         raise refusal(
             self._plant, f"has the output port {port}, which is not compiled: use its state, or keep it in Drake"
         )
@@ -145,6 +158,13 @@ class PlantEquations(Equations):
         pose = casadi.vertcat(p, roll_pitch_yaw_angles(R))
         (value,) = self._substituted([pose[list(POSE_ENTRIES).index(entry)]], at)
         return value
+
+    def _of_body(self, body: int, at: At) -> tuple[tuple[Expression, Expression], Expression]:
+        """Return the pose (R, p) and the velocity [angular; linear] of a body in the world, by its index."""
+        q, v = casadi.vertsplit(at.state(0), [0, self._model.nq, self._model.nq + self._model.nv])
+        motion = self._model.body_motion(body, q)
+        R, p, V = self._substituted([motion.R, motion.p, casadi.densify(motion.J @ v)], at)
+        return (R, p), V
 
     def _reactions(self, at: At) -> Callable[[int], Expression]:
         """Return the reaction forces of the present step, by the place of the joint among the plant's joints."""
@@ -162,7 +182,7 @@ class PlantEquations(Equations):
         step = self._step(at)
 
         def on_body(body: int) -> Expression:
-            forces = self._contact.forces_on(body, step.forces, step.q)
+            forces = self._forces_on(body, step)
             (load,) = self._substituted([casadi.SX(sum(casadi.norm_2(force) for _, force in forces))], at)
             return load
 
@@ -193,7 +213,7 @@ class PlantEquations(Equations):
             vdot = model.acceleration(q, v, tau, period=period)
             v_next = v + period * vdot
             overrun = casadi.SX(model.overrun(q, v_next, period))
-            return _Step(q, v, vdot, v_next, casadi.SX(3, 0), casadi.SX(0, 1), overrun)
+            return _Step(q, v, vdot, v_next, casadi.SX(3, 0), casadi.SX(0, 1), overrun, None)
         places = [drive.u for drive in self._drives.values()]
         solution = self._solver.step(q, v, tau, desired=self._desired(at), feed_forward=u[places])
         return _Step(q, v, (solution.v_next - v) / period, *solution)
@@ -236,8 +256,12 @@ class PlantEquations(Equations):
         """Yield the contact forces on bodies."""
         for body in bodies(self._plant):
             R, p = self._model.pose(body, step.q)
-            for point, force in self._contact.forces_on(int(body.index()), step.forces, step.q):
+            for point, force in self._forces_on(int(body.index()), step):
                 yield AppliedForce(int(body.index()), R.T @ (point - p), casadi.vertcat(casadi.SX(3, 1), force))
+
+    def _forces_on(self, body: int, step: _Step) -> Iterator[tuple[Expression, Expression]]:
+        """Return the contact forces on a body, by its index: where they act, and what they are."""
+        return iter(()) if step.contacts is None else self._contact.forces_on(body, step.forces, step.contacts)
 
     def _torque(self, at: At, u: Expression) -> Expression:
         """Return the generalized force of everything that is connected to the plant, without what the drives make."""

@@ -12,6 +12,7 @@ from vtbdrake.compiled.components import (
     ContactEquations,
     DriveEquations,
     ForceTorqueEquations,
+    ImuEquations,
     JointSensorEquations,
     JointTorqueEquations,
     SplineEquations,
@@ -29,6 +30,7 @@ from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.sensors import (
     ContactSensor,
     ForceTorqueSensor,
+    Imu,
     JointEncoders,
     JointTachometers,
     JointTorqueSensors,
@@ -43,6 +45,7 @@ EQUATIONS: dict[type, type[Equations]] = {
     ContactSensor: ContactEquations,
     JointDrives: DriveEquations,
     ForceTorqueSensor: ForceTorqueEquations,
+    Imu: ImuEquations,
     JointEncoders: JointSensorEquations,
     JointTachometers: JointSensorEquations,
     JointTorqueSensors: JointTorqueEquations,

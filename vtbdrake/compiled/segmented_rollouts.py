@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.compiled_rollouts import CompiledRollouts, Program
+from vtbdrake.compiled.equations import UnsupportedTestbedError
 from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.testbed.instants import sample_instants
 
@@ -29,6 +30,9 @@ class SegmentedRollouts:
         every: The number of samples of a segment.
         t0: The time at which the rollouts begin (s).
 
+    Raises:
+        UnsupportedTestbedError: A system may end the simulation.
+
     Attributes:
         instants: The simulator's times at the samples (s), shape (segments * every + 1,).
         record_size: The number ny of recorded values of a sample, see `CompiledRollouts.columns`; the last one, the
@@ -37,6 +41,10 @@ class SegmentedRollouts:
 
     def __init__(self, rollouts: CompiledRollouts, times: Array, *, every: int, t0: float) -> None:
         self._rollouts, self._walker = rollouts, rollouts.walker
+        if self._walker.endings:
+            raise UnsupportedTestbedError(
+                f"{self._walker.endings[0][0]} ends the simulation, which segments do not: keep this testbed in Drake"
+            )
         self.instants = sample_instants(times, t0, rollouts.timings)
         instants = schedule(self._walker.timings, self.instants)
         at_samples = [k for k, instant in enumerate(instants) if instant.is_sample]

@@ -71,9 +71,10 @@ class Block:
 class Walker:
     """A Diagram as expressions of z, the vector of all its discrete state and parameters, and of the time.
 
-    The last entry of z is the doubt: it becomes positive when the rollout departs from the Diagram's, because a state
-    is not finite, or by `Equations.doubt`, and stays so. It is then the number of a reason, and the entry before it is
-    the time.
+    The last four entries of z are no state. When a system ends the simulation, the time and the number of the ending
+    (see ``endings``) are written into the first two; nothing is updated any more. The last one is the doubt: it becomes
+    positive when the rollout departs from the Diagram's, because a state is not finite, or by `Equations.doubt`, and
+    stays so. It is then the number of a reason, and the entry before it is the time.
 
     Attributes:
         diagram: The Diagram.
@@ -87,6 +88,7 @@ class Walker:
         noise: The number of entries of w.
         fixed: Entries of z whose values are compiled in, with the address and the reason: (entries, path, reason).
         reasons: The reasons of a doubt, by its number from 1 on.
+        endings: (path, message) of all endings of a simulation, by number from 1 on.
     """
 
     def __init__(self, diagram: Diagram, context: Context, variables: Variables, varied: Sequence[str]) -> None:
@@ -116,7 +118,7 @@ class Walker:
         self.timings = tuple(dict.fromkeys(when for each in self.equations.values() for when, _ in each.updates()))
         self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
         self._extras = {self._address(b): b.entries for b in self.blocks.values() if b.kind == EXTRA}
-        self.size = max((block.entries.stop for block in self.blocks.values()), default=0) + 2
+        self.size = max((block.entries.stop for block in self.blocks.values()), default=0) + 4
         self.draws = tuple(self._reserved())
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
@@ -127,6 +129,8 @@ class Walker:
         }
         self.reasons = [f"the state of {path} is not finite" for path in self.equations]
         self.reasons += [f"{path}: {equations.doubtful}" for path, equations in self.equations.items()]
+        self.endings = tuple((path, message) for path, each in self.equations.items() for message in each.endings)
+        self._refuse_data_with_endings()
         self._all_fixed = _indices(entries for entries, _, _ in self.fixed)
         self._compiled_in = self._read_compiled_in(context)
 
@@ -306,6 +310,7 @@ class Walker:
                     if entries.start < entries.stop:
                         places.append(entries)
                         following[entries] = value
+        following[-4:-2] = self._ending(timing, at, z)
         following[-2:] = self._doubt(at, z, following, _indices(places))
         return casadi.densify(following)
 
@@ -330,6 +335,44 @@ class Walker:
             time: When it was noticed, in s.
         """
         return f"{self.reasons[round(doubt) - 1]} at t = {time:.9g} s" if doubt > 0.0 else ""
+
+    def message(self, ending: float, time: float) -> str:
+        """Return the message of Drake's Simulator when a system ends the simulation, or an empty text if none has.
+
+        Args:
+            ending: The number of the ending.
+            time: When it happened, in s.
+        """
+        if ending <= 0.0:
+            return ""
+        path, message = self.endings[round(ending) - 1]
+        system, when = self._systems[path], f"{time:.0f}" if time.is_integer() else repr(time)
+        return (
+            f"Simulator returned early at time {when} because {type(system).__module__}.{type(system).__qualname__} "
+            f"System '{system.GetSystemPathname()}' requested termination with message: \"{message}\""
+        )
+
+    def _ending(self, timing: Timing, at: InstantOutputs, z: Expression) -> Expression:
+        """Return the time and the number of the first ending of an instant, shape (2, 1)."""
+        number, present = 1, z[-3]
+        for path, equations in self.equations.items():
+            if equations.endings and equations.timing == timing:
+                with _addressed(path):
+                    ending = equations.ending(at.of(path))
+                ending_number = casadi.if_else(ending > 0, number - 1 + ending, 0)
+                is_first = casadi.logic_and(ending_number > 0, casadi.logic_or(present <= 0, ending_number < present))
+                present = casadi.if_else(is_first, ending_number, present)
+            number += len(equations.endings)
+        return casadi.vertcat(casadi.if_else(present > 0, at.time, z[-4]), present)
+
+    def _refuse_data_with_endings(self) -> None:
+        """Refuse outputs that go on changing after the end of the simulation, when its last sample is taken."""
+        data = [path for path, _, _, _ in self.draws if self.equations[path].timing is None]
+        if data and self.endings:
+            raise UnsupportedTestbedError(
+                f"{self.endings[0][0]} ends the simulation, and {data[0]} shows data without updates, which is not "
+                "compiled together: keep this testbed in Drake"
+            )
 
     def _doubt(self, at: InstantOutputs, earlier: Expression, following: Expression, entries: Array) -> Expression:
         """Return the time of the doubt and the doubt, shape (2, 1); all that counts at the instant has been written.

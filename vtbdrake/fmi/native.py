@@ -48,6 +48,10 @@ def native_model(part: ExportedPart, step: float) -> str:
             compile=False,
         )
         _refuse_draws(rollouts)
+        if rollouts.walker.endings:
+            raise UnsupportedTestbedError(
+                f"{rollouts.walker.endings[0][0]} ends the simulation, which no native FMU does: leave it out"
+            )
     except UnsupportedTestbedError as error:
         raise UnsupportedTestbedError(f"{error}{_INSTEAD}") from None
     return "\n".join((_functions(rollouts), _TYPES, _tables(part, rollouts), _text("native.c")))

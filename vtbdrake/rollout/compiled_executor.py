@@ -6,7 +6,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from math import inf, nan
 from typing import Any
 
@@ -22,7 +22,7 @@ from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.quality import Measure, QualityError, exceeds, read_quality
 from vtbdrake.rollout.runner import values_key
 from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
-from vtbdrake.rollout.task import HORIZON, THRESHOLD, RolloutResult, RolloutTask, check_call
+from vtbdrake.rollout.task import HORIZON, TERMINATED, THRESHOLD, RolloutResult, RolloutTask, check_call
 from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Testbeds, split
 from vtbdrake.state.variables import A
 from vtbdrake.testbed import VirtualTestbed
@@ -338,32 +338,49 @@ class _CompiledTask:
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Yield (row, result) of the rollouts of a batch, except those that Drake makes: invalid, or f fails."""
         task, valid, samples = self._task, batch.valid.copy(), []
-        counts = np.full(len(points), len(batch.times))
+        counts = batch.counts.copy()
         for row in np.flatnonzero(~valid).tolist():
             _log.info("a rollout is simulated in Drake: %s", batch.reasons[row])
         for k, measure in enumerate(self._measures):
-            samples.append(self._samples(k, measure, batch.outputs, counts, valid))
+            samples.append(self._samples(k, measure, batch, counts, valid))
             if k == 0 and task.threshold is not None and not task.run_on:
                 exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
-                counts = np.where(exceeded.any(axis=1), exceeded.argmax(axis=1) + 1, counts)
-        for count in set(counts[valid].tolist()):
-            rows = np.flatnonzero(valid & (counts == count))
-            yield from self._read(points, rows, batch, [each[rows, :count] for each in samples], wall_time)
+                # What follows the end of a simulation repeats its last sample.
+                counts = np.where(exceeded.any(axis=1), np.minimum(exceeded.argmax(axis=1) + 1, counts), counts)
+        ends = np.where(counts == batch.counts, batch.ends, inf)  # Others end before, where f exceeds its threshold.
+        for count, end in sorted(set(zip(counts[valid].tolist(), ends[valid].tolist(), strict=True))):
+            rows = np.flatnonzero(valid & (counts == count) & (ends == end))
+            times = batch.times[:count].copy()
+            if end < inf:
+                times[-1] = end
+            of_rows = [each[rows, :count] for each in samples]
+            yield from self._read(points, rows, batch, times, of_rows, HORIZON if end == inf else TERMINATED, wall_time)
 
     def _read(
         self,
         points: Sequence[Parameters],
         rows: np.ndarray,
         batch: CompiledBatch,
+        times: np.ndarray,
         samples: Sequence[np.ndarray],
+        end: str,
         wall_time: float,
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Yield (row, result) of rollouts of equal length from their samples, of shape (rows, m) for each measure."""
+        """Yield (row, result) of rollouts with the same sample times from their samples.
+
+        Args:
+            points: The points of all rollouts.
+            rows: Which of them have these times.
+            batch: The results of all of them.
+            times: The sample times, shape (m,), in s.
+            samples: The samples of each measure, shape (rows, m).
+            end: How they ended, unless f has exceeded its threshold.
+            wall_time: The share of the wall time, in s.
+        """
         task, f = self._task, self._task.quality
         # So that sums over time have the same order, and result, as in a single rollout.
         samples = [np.ascontiguousarray(each) for each in samples]
-        m = samples[0].shape[1] if samples else len(batch.times)
-        times = batch.times[:m]
+        m = len(times)
         t_star = h = value = np.full(len(rows), nan)
         quality, of_measures = np.empty((len(rows), 0)), samples
         exceedances: dict[int, np.ndarray] = {}
@@ -382,7 +399,8 @@ class _CompiledTask:
             if finite[k]:
                 result = RolloutResult(
                     parameters=dict(points[row]),
-                    end=THRESHOLD if k in exceedances else HORIZON,
+                    end=THRESHOLD if k in exceedances else end,
+                    message="" if k in exceedances or end == HORIZON else batch.messages[row],
                     times=times,
                     quality=quality[k],
                     t_star=t,
@@ -398,26 +416,29 @@ class _CompiledTask:
                 yield row, result
 
     def _samples(
-        self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], counts: np.ndarray, valid: np.ndarray
+        self, k: int, measure: Measure, batch: CompiledBatch, counts: np.ndarray, valid: np.ndarray
     ) -> np.ndarray:
         """Return the samples of a measure, shape (n, m).
 
         Args:
             k: The number of the measure.
             measure: The measure.
-            outputs: What was recorded, each of shape (n, m, ...).
+            batch: The results of the rollouts.
             counts: The number of samples of each rollout, shape (n,); later ones do not matter.
             valid: Whether a rollout is valid, shape (n,); where f fails, it is set to False.
         """
         if f"measure {k}" in self._traced:
-            traced: np.ndarray = outputs[f"measure {k}"]
+            traced: np.ndarray = batch.outputs[f"measure {k}"]
             valid &= measure.accepts(traced).all(axis=1)
             return traced
         samples = np.full((len(valid), len(self._rollouts.times)), nan)
-        recorded = [outputs[address] for address in measure.of]
+        recorded = [batch.outputs[address] for address in measure.of]
         for row in np.flatnonzero(valid).tolist():
             try:
-                for i, t in enumerate(self._rollouts.times[: counts[row]].tolist()):
+                times = batch.times[: counts[row]].tolist()
+                if counts[row] == batch.counts[row] and batch.ends[row] < inf:
+                    times[-1] = float(batch.ends[row])
+                for i, t in enumerate(times):
                     samples[row, i] = measure([_value(each[row, i]) for each in recorded], time=t)
                     if k == 0 and measure is self._task.quality and self._exceeds(samples[row, i]):
                         break

@@ -4,27 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Convex, GeometryId, Mesh, SceneGraphInspector, Shape
+from pydrake.geometry import Box, Convex, GeometryId, Mesh, SceneGraphInspector, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
+from vtbdrake.components.compiled_plant.ground import SLOTS, Piece, ground_contact
 from vtbdrake.components.compiled_plant.links import (
     UnsupportedPlantError,
     colliding,
     constant_pose,
     rounding_beside,
+    skew,
     times,
 )
 from vtbdrake.components.compiled_plant.touching import can_touch, is_iterated, touch
 
 Expression = Any  # casadi.SX
+
+# A sphere with more fixed boxes and hulls that it may touch looks for them in a grid.
+_MANY_PIECES = 16
+_PIECES = (Box, Convex, Mesh)
 
 _APPROXIMATIONS = (DiscreteContactApproximation.kSap, DiscreteContactApproximation.kLagged)
 
@@ -34,6 +41,7 @@ class Surface:
     """A collision geometry G.
 
     Attributes:
+        geometry: Drake's number of it.
         name: Its name, and its body's.
         body: Index of the body B.
         shape: Its shape.
@@ -45,6 +53,7 @@ class Surface:
         vertices: Vertices of its convex hull in its frame, shape (n, 3), in m; n is 0 unless it is a mesh.
     """
 
+    geometry: int
     name: str
     body: int
     shape: Shape
@@ -78,6 +87,42 @@ class Pair:
         return stiffness, dissipation, 2.0 * a.friction * b.friction / both if both else 0.0
 
 
+class Contacts(NamedTuple):
+    """All contacts that there may be, as expressions: first the pairs, then places for spheres on ground.
+
+    Attributes:
+        J: Jacobians of the pairs, see `PointContact.touch`, shape (3 pairs, nv).
+        normals: The normals from the first into the second geometry in the world, shape (3, n); ground is the second.
+        distances: The distances in m, shape (n, 1).
+        material: Stiffness, dissipation and friction, each of shape (n, 1).
+        points: Where the forces act in the world, shape (3, n), in m.
+        J_spheres: Angular and linear Jacobians of the spheres' centres, in the world, shape (6 spheres, nv).
+        offsets: The points of the spheres' contacts less their centres, shape (3, spheres * SLOTS), in m.
+        doubt: Positive where there are more contacts than places.
+    """
+
+    J: Expression
+    normals: Expression
+    distances: Expression
+    material: tuple[Expression, Expression, Expression]
+    points: Expression
+    J_spheres: Expression
+    offsets: Expression
+    doubt: Expression
+
+
+class Ground(NamedTuple):
+    """Spheres, and many fixed pieces that each of them may touch.
+
+    Attributes:
+        spheres: The spheres.
+        pieces: The pieces, in the order of their numbers.
+    """
+
+    spheres: tuple[Surface, ...]
+    pieces: tuple[Surface, ...]
+
+
 def contact_pairs(plant: MultibodyPlant, context: Context) -> tuple[Pair, ...]:
     """Return the pairs of geometries that may touch.
 
@@ -108,11 +153,17 @@ class _SurfaceReader:
 
     def __init__(self, plant: MultibodyPlant, inspector: SceneGraphInspector) -> None:
         self._plant, self._inspector = plant, inspector
+        self._surfaces: dict[GeometryId, Surface] = {}
         dissipation = "hunt_crossley_dissipation" if is_lagged(plant) else "relaxation_time"
         self._kinds = "point_contact_stiffness", dissipation
 
     def surface(self, geometry: GeometryId, body: RigidBody) -> Surface:
         """Return the geometry with an id on a body."""
+        if geometry not in self._surfaces:
+            self._surfaces[geometry] = self._new_surface(geometry, body)
+        return self._surfaces[geometry]
+
+    def _new_surface(self, geometry: GeometryId, body: RigidBody) -> Surface:
         inspector = self._inspector
         properties = inspector.GetProximityProperties(geometry)
         name = f"{inspector.GetName(geometry)} of {body.name()}"
@@ -133,7 +184,8 @@ class _SurfaceReader:
         if isinstance(shape, Convex | Mesh):
             hull = inspector.GetConvexHull(geometry)
             vertices = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
-        return Surface(name, int(body.index()), shape, X_BG, stiffness, dissipation, friction, vertices)
+        number = geometry.get_value()
+        return Surface(number, name, int(body.index()), shape, X_BG, stiffness, dissipation, friction, vertices)
 
 
 def _pair(first: Surface, second: Surface) -> Pair:
@@ -161,37 +213,130 @@ class PointContact:
         pairs: What may touch, see `contact_pairs`.
 
     Attributes:
-        pairs: What may touch.
+        pairs: What may touch, but for spheres that may touch many fixed pieces.
+        grounds: These spheres, with their pieces.
     """
 
     def __init__(self, plant: MultibodyPlant, model: PlantDynamics, pairs: Sequence[Pair]) -> None:
-        self._model, self.pairs = model, tuple(pairs)
+        self._model = model
         self._is_lagged = is_lagged(plant)
+        self.pairs, self.grounds = self._divided(pairs)
+        self._kernels = [self._ground_kernel(ground) for ground in self.grounds]
 
     def is_iterated(self) -> bool:
         """Return whether Drake iterates for a pair, and ends elsewhere if a pose is rounded otherwise."""
-        return any(is_iterated(pair.first.shape, pair.second.shape) for pair in self.pairs)
+        has_hulls = any(not isinstance(piece.shape, Box) for ground in self.grounds for piece in ground.pieces)
+        return has_hulls or any(is_iterated(pair.first.shape, pair.second.shape) for pair in self.pairs)
+
+    @property
+    def sphere_count(self) -> int:
+        """Return the number of spheres on ground."""
+        return sum(len(ground.spheres) for ground in self.grounds)
 
     def materials(self) -> np.ndarray:
         """Return stiffness, dissipation and friction of each pair, shape (n, 3); see `Pair.material`."""
         return np.array([pair.material(is_lagged=self._is_lagged) for pair in self.pairs]).reshape(-1, 3)
 
     def places(self) -> list[list[int]]:
-        """Return the places of the velocities that move each pair."""
-        return [sorted({*self._model.way(pair.first.body), *self._model.way(pair.second.body)}) for pair in self.pairs]
+        """Return the places of the velocities that move each contact."""
+        of_pairs = [[*self._model.way(pair.first.body), *self._model.way(pair.second.body)] for pair in self.pairs]
+        of_spheres = [self._model.way(sphere.body) for sphere in self._spheres() for _ in range(SLOTS)]
+        return [sorted(set(places)) for places in (*of_pairs, *of_spheres)]
 
-    def forces_on(self, body: int, forces: Expression, q: Expression) -> Iterator[tuple[Expression, Expression]]:
+    def forces_on(self, body: int, forces: Expression, contacts: Contacts) -> Iterator[tuple[Expression, Expression]]:
         """Yield the contact forces on a body: where they act, and what they are; both in the world, shape (3, 1).
 
         Args:
             body: Index of the body.
             forces: The contact forces of `SapSolver.step`.
-            q: Positions before the step, shape (nq, 1).
+            contacts: The contacts of this step.
         """
         for i, pair in enumerate(self.pairs):
             for surface, sign in ((pair.first, 1.0), (pair.second, -1.0)):
                 if surface.body == body:
-                    yield self._meet(pair, q)[0], sign * forces[:, i]
+                    yield contacts.points[:, i], sign * forces[:, i]
+        for i, sphere in enumerate(self._spheres()):
+            if sphere.body == body:
+                for at in range(len(self.pairs) + i * SLOTS, len(self.pairs) + (i + 1) * SLOTS):
+                    yield contacts.points[:, at], forces[:, at]
+
+    def contacts(self, q: Expression) -> Contacts:
+        """Return all contacts that there may be at positions q, shape (nq, 1)."""
+        touching = [self.touch(pair, q) for pair in self.pairs]
+        points = [self._meet(pair, q)[0] for pair in self.pairs]
+        poses = [self._pose(sphere, q) for sphere in self._spheres()]
+        results, start = [], 0
+        for ground, kernel in zip(self.grounds, self._kernels, strict=True):
+            R, p = zip(*poses[start : start + len(ground.spheres)], strict=True)
+            results.append(kernel(casadi.densify(casadi.horzcat(*R)), casadi.densify(casadi.horzcat(*p))))
+            start += len(ground.spheres)
+        on_ground = [[result[k] for result in results] for k in range(7)]
+        offsets = casadi.horzcat(casadi.SX(3, 0), *on_ground[2])
+        centers = casadi.horzcat(casadi.SX(3, 0), *(p for _, p in poses for _ in range(SLOTS)))
+        stiffness, dissipation, friction = (
+            casadi.vertcat(casadi.SX(casadi.DM(column)), *on_ground[3 + k])
+            for k, column in enumerate(self.materials().T)
+        )
+        return Contacts(
+            J=casadi.vertcat(casadi.SX(0, self._model.nv), *(J for J, _, _ in touching)),
+            normals=casadi.horzcat(casadi.SX(3, 0), *(normal for _, normal, _ in touching), *on_ground[1]),
+            distances=casadi.vertcat(casadi.SX(0, 1), *(distance for _, _, distance in touching), *on_ground[0]),
+            material=(stiffness, dissipation, friction),
+            points=casadi.horzcat(casadi.SX(3, 0), *points, centers + offsets),
+            J_spheres=casadi.vertcat(casadi.SX(0, self._model.nv), *self._sphere_jacobians(q)),
+            offsets=offsets,
+            doubt=casadi.SX(casadi.mmax(casadi.vertcat(0.0, *on_ground[6]))),
+        )
+
+    def _spheres(self) -> list[Surface]:
+        return [sphere for ground in self.grounds for sphere in ground.spheres]
+
+    def _sphere_jacobians(self, q: Expression) -> Iterator[Expression]:
+        """Yield the angular and linear Jacobian of the centre of each sphere on ground, shape (6, nv)."""
+        for sphere in self._spheres():
+            motion = self._model.body_motion(sphere.body, q)
+            offset = self._pose(sphere, q)[1] - motion.p
+            yield casadi.vertcat(motion.J[:3, :], motion.J[3:, :] - skew(offset) @ motion.J[:3, :])
+
+    def _divided(self, pairs: Sequence[Pair]) -> tuple[tuple[Pair, ...], tuple[Ground, ...]]:
+        """Return the pairs without the spheres that may touch many fixed pieces, and these spheres as grounds."""
+        partners: dict[int, list[tuple[Surface, Surface, Pair]]] = {}
+        for pair in pairs:
+            for sphere, piece in ((pair.first, pair.second), (pair.second, pair.first)):
+                is_piece = isinstance(piece.shape, _PIECES) and not self._model.way(piece.body)
+                if isinstance(sphere.shape, Sphere) and is_piece and self._model.way(sphere.body):
+                    partners.setdefault(sphere.geometry, []).append((sphere, piece, pair))
+        many = [each for each in partners.values() if len(each) > _MANY_PIECES]
+        on_ground = {id(pair) for each in many for _, _, pair in each}
+        grounds: dict[tuple[int, ...], Ground] = {}
+        for each in many:
+            pieces = tuple(sorted((piece for _, piece, _ in each), key=lambda piece: piece.geometry))
+            key = tuple(piece.geometry for piece in pieces)
+            spheres = grounds[key].spheres if key in grounds else ()
+            grounds[key] = Ground((*spheres, each[0][0]), pieces)
+        return tuple(pair for pair in pairs if id(pair) not in on_ground), tuple(grounds.values())
+
+    def _ground_kernel(self, ground: Ground) -> casadi.Function:
+        """Return the function of where spheres touch ground."""
+        nowhere = casadi.SX.sym("q", self._model.nq)
+        poses = [[casadi.evalf(each).full() for each in self._pose(piece, nowhere)] for piece in ground.pieces]
+        pieces = [
+            Piece(piece.geometry, piece.shape, R, p.ravel(), piece.vertices)
+            for piece, (R, p) in zip(ground.pieces, poses, strict=True)
+        ]
+        materials = [
+            [
+                (
+                    *Pair(sphere, piece).material(is_lagged=self._is_lagged),
+                    sphere.stiffness / (sphere.stiffness + piece.stiffness),
+                )
+                for piece in ground.pieces
+            ]
+            for sphere in ground.spheres
+        ]
+        return ground_contact(
+            [(sphere.geometry, sphere.shape) for sphere in ground.spheres], pieces, np.array(materials)
+        )
 
     # -- where it touches
 

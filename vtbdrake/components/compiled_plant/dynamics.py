@@ -448,8 +448,17 @@ class PlantDynamics:
             p_WP: Where the point is now, in the world, shape (3, 1).
             q: Positions, shape (nq, 1).
         """
-        motion = self._motion_on_link(*self._mounts[body], q)
+        motion = self.body_motion(body, q)
         return motion.J[3:, :] - skew(p_WP - motion.p) @ motion.J[:3, :]
+
+    def body_motion(self, body: int, q: Expression) -> FrameMotion:
+        """Return pose and Jacobian of a body.
+
+        Args:
+            body: Index of the body.
+            q: Positions, shape (nq, 1).
+        """
+        return self._motion_on_link(*self._mounts[body], q)
 
     def way(self, body: int) -> list[int]:
         """Return the places of the velocities that move a body."""

@@ -42,7 +42,9 @@ def penetration(first: Shape, second: Shape, vertices: tuple[NDArray[np.float64]
 
 @lru_cache(maxsize=256)
 def _compiled(definitions: str) -> casadi.Function:
-    text = definitions + files(__package__).joinpath("mpr.c").read_text(encoding="utf-8")
+    text = definitions + "".join(
+        files(__package__).joinpath(name).read_text(encoding="utf-8") for name in ("mpr.c", "mpr_pair.c")
+    )
     name = f"mpr_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     signature = kernel_signature(name, [(3, 3), (3, 1), (3, 3), (3, 1)], [(1, 1), (3, 1), (3, 1)])
     return compiled_kernel(name, f"#define NAME {name}\n{text}{signature}")

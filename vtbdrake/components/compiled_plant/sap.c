@@ -6,7 +6,7 @@ The velocities v after the step minimize
 
 by Newton's method with an exact line search. Iterations begin, proceed and end as Drake's do, at an error of 1e-6 of the
 momentum: what is left of it is the same, too, and does not drive apart what is sensitive. A = M + dt D is factored as L' L along the tree of velocities
-(Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: PARENT tells the velocity next to each on the way to the
+(Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: WAY tells the velocities next to each on the way to the
 root, and each contact moves with velocities of one way. Contact models are those of Drake's discrete plant,
 
     SAP:    impulses projected onto the friction cone, with a compliance at least that of near-rigid contact;
@@ -17,17 +17,20 @@ The frame of a contact has its z along the normal, from body 1 into body 2; velo
 An axis is an impulse on one velocity that falls linearly with it, between two bounds. Stops of joints (Drake's
 SapLimitConstraint) and PD controllers of actuators with their effort limits (SapPdControllerConstraint) are axes.
 
-The text before this one defines NAME; NV, NC, NS, ND: the numbers of velocities, contacts, joints with stops and
+The text before this one defines NAME; NV, NP, NC, NS, ND: the numbers of velocities, pairs, contacts, joints with stops and
 actuators with a controller; LAGGED: 0 or 1; DT: the time step (s); BETA: the near-rigid threshold; VS: the stiction
-tolerance (m/s); PARENT[NV]; TREE[NV]: the number of the tree of
+tolerance (m/s); DEPTH[NV] and WAY[NV][NV]; TREE[NV]: the number of the tree of
 joints, below NV, that a velocity belongs to; COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; STOP[NS]: the velocity of
 a joint with stops, LOWER[NS] and UPPER[NS] (rad or m); DRIVE[ND]: the velocity of an actuator, KP[ND], KD[ND] and
 EFFORT[ND] (N m or N). Tables have a row more, because C has no empty ones.
 
-Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), J (3 NC, NV) in the world, normals
+The contacts after those of the NP pairs are places for SLOTS contacts of each of NF spheres with fixed ground.
+
+Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), J (3 NP, NV) in the world, normals
 (3, NC), distances (NC, m, below 0 in contact), stiffness (NC, N/m), dissipation (NC: SAP's time in s, or LAGGED's in s/m),
 friction (NC); the positions of the joints with stops (NS); of the controllers KP (q_d - q) + KD v_d (ND), with the
-position before the step, and the feed-forward actuation (ND).
+position before the step, and the feed-forward actuation (ND); of the centres of the spheres the angular and the linear
+Jacobian (6 NF, NV) in the world, and the points of their contacts less the centre (3, NC - NP, m).
 Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of the controllers (ND, N m or N); and a doubt:
 1 where the iteration did not converge, else 0. */
 
@@ -36,7 +39,7 @@ Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of th
 #include <math.h>
 #include <string.h>
 
-#define ARGUMENTS 12
+#define ARGUMENTS 14
 /* Numbers of Drake's SapSolver. */
 #define MOST_ITERATIONS 100     /* also of a line search */
 #define TOLERANCE 1e-6          /* of the momentum */
@@ -80,9 +83,12 @@ static int factor(double (*H)[NV]) {
         if (!(H[k][k] > 0.0)) return 0;
         double d = sqrt(H[k][k]);
         H[k][k] = d;
-        for (int i = PARENT[k]; i >= 0; i = PARENT[i]) H[k][i] /= d;
-        for (int i = PARENT[k]; i >= 0; i = PARENT[i])
-            for (int j = i; j >= 0; j = PARENT[j]) H[i][j] -= H[k][i] * H[k][j];
+        double row[NV];
+        for (int a = 0; a < DEPTH[k]; ++a) row[a] = H[k][WAY[k][a]] /= d;
+        for (int a = 0; a < DEPTH[k]; ++a) {
+            double *below = H[WAY[k][a]];
+            for (int b = a; b < DEPTH[k]; ++b) below[WAY[k][b]] -= row[a] * row[b];
+        }
     }
     return 1;
 }
@@ -90,10 +96,10 @@ static int factor(double (*H)[NV]) {
 static void solve(double (*L)[NV], double *x) {
     for (int i = NV - 1; i >= 0; --i) {
         x[i] /= L[i][i];
-        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) x[j] -= L[i][j] * x[i];
+        for (int a = 0; a < DEPTH[i]; ++a) x[WAY[i][a]] -= L[i][WAY[i][a]] * x[i];
     }
     for (int i = 0; i < NV; ++i) {
-        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) x[i] -= L[i][j] * x[j];
+        for (int a = 0; a < DEPTH[i]; ++a) x[i] -= L[i][WAY[i][a]] * x[WAY[i][a]];
         x[i] /= L[i][i];
     }
 }
@@ -101,11 +107,13 @@ static void solve(double (*L)[NV], double *x) {
 static void multiply(double (*A)[NV], const double *x, double *y) {
     memset(y, 0, NV * sizeof *y);
     for (int i = 0; i < NV; ++i) {
-        y[i] += A[i][i] * x[i];
-        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) {
-            y[i] += A[i][j] * x[j];
+        double sum = A[i][i] * x[i];
+        for (int a = 0; a < DEPTH[i]; ++a) {
+            int j = WAY[i][a];
+            sum += A[i][j] * x[j];
             y[j] += A[i][j] * x[i];
         }
+        y[i] += sum;
     }
 }
 
@@ -216,6 +224,19 @@ static void prepare(Contact *c, const double *scale, const double *v0) {
 #endif
 }
 
+/* The velocity of body 2 against body 1 at a contact for each unit of the velocity i, in the world. */
+static void column(const double *const *in, int at, int i, double *J) {
+    if (at < NP) {
+        memcpy(J, in[3] + 3 * at + 3 * NP * i, 3 * sizeof *J);
+        return;
+    }
+    int slot = at - NP;
+    const double *w = in[12] + 6 * (slot / SLOTS) + 6 * NF * i, *v = w + 3, *r = in[13] + 3 * slot;
+    J[0] = -(v[0] + w[1] * r[2] - w[2] * r[1]);
+    J[1] = -(v[1] + w[2] * r[0] - w[0] * r[2]);
+    J[2] = -(v[2] + w[0] * r[1] - w[1] * r[0]);
+}
+
 static void add_contacts(Problem *p, const double *const *in, const double *v0) {
     for (int at = 0; at < NC; ++at) {
         if (!(in[5][at] <= 0.0)) continue;
@@ -224,7 +245,8 @@ static void add_contacts(Problem *p, const double *const *in, const double *v0) 
         frame(in[4] + 3 * at, c->R_WC);
         for (int m = 0; m < COUNT[at]; ++m) {
             int i = COLUMNS[at][m];
-            const double *J = in[3] + 3 * at + 3 * NC * i;
+            double J[3];
+            column(in, at, i, J);
             for (int r = 0; r < 3; ++r) c->J[r][i] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
         }
         prepare(c, p->scale, v0);
@@ -400,7 +422,7 @@ static void write_forces(const Problem *p, const double *v, double *forces) {
 
 /* Set up the problem of one step from the arguments, and solve it; return whether that worked. */
 static int take_step(const double **arg, Problem *p, double *v) {
-    static const double none[3 * NC * NV + NV * NV + NS + ND + 1] = {0.0};
+    static const double none[3 * NC * NV + 6 * NF * NV + NV * NV + NS + ND + 1] = {0.0};
     const double *in[ARGUMENTS];
     for (int i = 0; i < ARGUMENTS; ++i) in[i] = arg[i] ? arg[i] : none; /* CasADi's way to say that all are zero */
     double L[NV][NV];

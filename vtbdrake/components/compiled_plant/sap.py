@@ -15,8 +15,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointActuator
 
 from vtbdrake.components.casadi_system.compiler import compiled_kernel, kernel_signature
-from vtbdrake.components.compiled_plant.contact import PointContact, is_lagged
+from vtbdrake.components.compiled_plant.contact import Contacts, PointContact, is_lagged
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
+from vtbdrake.components.compiled_plant.ground import SLOTS
 from vtbdrake.state.multibody import bodies
 
 Expression = Any  # casadi.SX
@@ -83,13 +84,15 @@ class Solution(NamedTuple):
         v_next: Velocities after the step, shape (nv, 1).
         forces: Forces on the other geometry of each of the pairs in contact, in the world, shape (3, n), in N.
         efforts: Actuation of the drives, feed-forward included and within the effort limits, shape (m, 1), in N m or N.
-        doubt: Positive where the iteration did not converge.
+        doubt: Positive where the iteration did not converge, or a sphere touches more than `SLOTS` pieces of ground.
+        contacts: The contacts that were taken into account.
     """
 
     v_next: Expression
     forces: Expression
     efforts: Expression
     doubt: Expression
+    contacts: Contacts
 
 
 def stops(plant: MultibodyPlant) -> tuple[JointStops, ...]:
@@ -145,37 +148,42 @@ class SapSolver:
             desired: Desired positions and velocities of the drives, shape (m, 2); needed if there are some.
             feed_forward: Actuation that is added to the drives' controllers, shape (m, 1); by default none.
         """
-        drives, n = self._drives, len(self._contact.pairs)
+        drives, contacts = self._drives, self._contact.contacts(q)
         A, p_star = self._model.momentum_balance(q, v, tau, self._plant.time_step())
-        touching = [self._contact.touch(pair, q) for pair in self._contact.pairs]
-        material = casadi.SX(casadi.DM(self._contact.materials()))
         pulls = [d.p * (desired[k, 0] - q[d.q]) + d.d * desired[k, 1] for k, d in enumerate(drives)]
         arguments = (
             A,
             p_star,
             v,
-            casadi.vertcat(casadi.SX(0, self._model.nv), *(J for J, _, _ in touching)),
-            casadi.horzcat(casadi.SX(3, 0), *(normal for _, normal, _ in touching)),
-            casadi.vertcat(casadi.SX(0, 1), *(distance for _, _, distance in touching)),
-            *(material[:, k] for k in range(3)),
+            contacts.J,
+            contacts.normals,
+            contacts.distances,
+            *contacts.material,
             q[[stop.q for stop in self._stops]],
             casadi.vertcat(casadi.SX(0, 1), *pulls),
             casadi.SX.zeros(len(drives), 1) if feed_forward is None else feed_forward,
+            contacts.J_spheres,
+            contacts.offsets,
         )
         v_next, forces, efforts, doubt = self._kernel(*map(casadi.densify, arguments))
-        return Solution(v_next, casadi.reshape(forces, 3, n), efforts, doubt)
+        forces = casadi.reshape(forces, 3, contacts.distances.numel())
+        return Solution(v_next, forces, efforts, casadi.fmax(doubt, contacts.doubt), contacts)
 
     def _source(self) -> tuple[str, str]:
         """Return the name and the C code of the kernel for this plant."""
-        nv, n, stops, drives = self._model.nv, len(self._contact.pairs), self._stops, self._drives
-        places = self._contact.places()
+        nv, stops, drives = self._model.nv, self._stops, self._drives
+        places, pairs, spheres = self._contact.places(), len(self._contact.pairs), self._contact.sphere_count
+        n, parents = len(places), self._elimination_tree(self._contact.places())
+        ways = [_way(parents, row) for row in range(nv)]
         text = "".join(
             (
-                f"#include <math.h>\n#define NV {nv}\n#define NC {n}\n#define NS {len(stops)}\n",
+                f"#include <math.h>\n#define NV {nv}\n#define NP {pairs}\n#define NC {n}\n#define NS {len(stops)}\n",
                 f"#define ND {len(drives)}\n#define LAGGED {int(is_lagged(self._plant))}\n",
                 f"#define DT {self._plant.time_step()!r}\n#define VS {_STICTION_TOLERANCE!r}\n",
                 f"#define BETA {self._plant.get_sap_near_rigid_threshold()!r}\n",
-                _table("int PARENT", self._elimination_tree(places)),
+                f"#define NF {spheres}\n#define SLOTS {SLOTS}\n",
+                _table("int DEPTH", [len(way) for way in ways]),
+                f"static const int WAY[NV + 1][NV + 1] = {{{', '.join([*map(_row, ways), '{0}'])}}};\n",
                 _table("int TREE", self._trees()),
                 _table("int COUNT", [len(row) for row in places]),
                 f"static const int COLUMNS[NC + 1][NV] = {{{', '.join([*map(_row, places), '{0}'])}}};\n",
@@ -190,7 +198,18 @@ class SapSolver:
             )
         )
         m = len(drives)
-        shapes_in = [(nv, nv), (nv, 1), (nv, 1), (3 * n, nv), (3, n), *[(n, 1)] * 4, (len(stops), 1), (m, 1), (m, 1)]
+        shapes_in = [
+            (nv, nv),
+            (nv, 1),
+            (nv, 1),
+            (3 * pairs, nv),
+            (3, n),
+            *[(n, 1)] * 4,
+            (len(stops), 1),
+            (m, 1),
+            (m, 1),
+        ]
+        shapes_in += [(6 * spheres, nv), (3, n - pairs)]
         shapes_out = [(nv, 1), (3, n), (m, 1), (1, 1)]
         name = f"sap_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
         source = f"#define NAME {name}\n{text}{kernel_signature(name, shapes_in, shapes_out)}"
@@ -239,9 +258,17 @@ def _elimination_tree(cliques: Sequence[Sequence[int]], size: int) -> list[int]:
     return parents
 
 
+def _way(parents: Sequence[int], row: int) -> list[int]:
+    """Return the rows on the way from a row to the root, without itself."""
+    way = []
+    while (row := parents[row]) >= 0:
+        way.append(row)
+    return way
+
+
 def _row(numbers: ArrayLike) -> str:
-    """Return numbers as a C initializer."""
-    return f"{{{', '.join(str(x).replace('inf', 'INFINITY') for x in np.asarray(numbers).tolist())}}}"
+    """Return numbers as a C initializer, which is never empty."""
+    return f"{{{', '.join(str(x).replace('inf', 'INFINITY') for x in np.asarray(numbers).tolist()) or '0'}}}"
 
 
 def _table(declarator: str, numbers: Sequence[float]) -> str:

@@ -51,6 +51,14 @@ class Imu(SampledSensor):
     Args:
         plant: The finalized plant.
         frame: A frame of the plant, at which the sensor begins.
+
+    Attributes:
+        entry_names: Names of the entries of the output.
+        settings: The parameter ``mount``.
+        memory: The state: whether there was a sample, and v_WF (m/s) and q_WF (wxyz) at the last one.
+        gravity: The acceleration of free fall in the world, shape (3,), in m/s^2.
+        body: Index of the body in the plant.
+        floating_places: Where q_WB (wxyz) and V_WB ([w; v]) begin in the port ``state``; None without this port.
     """
 
     def __init__(
@@ -64,14 +72,14 @@ class Imu(SampledSensor):
     ) -> None:
         body = frame.body()
         default_context = plant.CreateDefaultContext()
-        self._g_W = np.array(plant.gravity_field().gravity_vector())
-        self._body = int(body.index())
+        self.gravity = np.array(plant.gravity_field().gravity_vector())
+        self.body = int(body.index())
         X_BF = frame.GetFixedPoseInBodyFrame()
         mount = [*X_BF.translation().tolist(), *RollPitchYaw(X_BF.rotation()).vector().tolist()]
         q_WF = frame.CalcPoseInWorld(default_context).rotation().ToQuaternion().wxyz()
         super().__init__(
             "imu",
-            default=(0.0, 0.0, 0.0, *specific_force_at_rest(q_WF, self._g_W)),
+            default=(0.0, 0.0, 0.0, *specific_force_at_rest(q_WF, self.gravity)),
             period=period,
             unit="rad/s, m/s^2",
             noise={"gyro_noise": (3, "rad/s"), "accelerometer_noise": (3, "m/s^2")},
@@ -79,37 +87,36 @@ class Imu(SampledSensor):
             errors=errors,
         )
         self.entry_names = tuple(f"{quantity} {axis}" for quantity in ("rate", "force") for axis in "xyz")
-        self._settings = self.declare_parameters(mount=Quantity(mount, "m, rad"))
-        # Whether there was a sample; v_WF and q_WF (wxyz) at the last one.
-        self._memory = self.declare_discrete_state(
+        self.settings = self.declare_parameters(mount=Quantity(mount, "m, rad"))
+        self.memory = self.declare_discrete_state(
             sampled=Quantity(0.0, bounds=(0.0, 1.0)),
             last_velocity=Quantity(np.zeros(3), "m/s"),
             last_orientation=Quantity([1.0, 0.0, 0.0, 0.0]),
         )
-        self._floating = body.is_floating_base_body() and body.has_quaternion_dofs()
-        if self._floating:
+        self.floating_places: tuple[int, int] | None = None
+        if body.is_floating_base_body() and body.has_quaternion_dofs():
             # [q; v] holds (wxyz, p_WB) and (w_WB, v_WB). Much cheaper than the poses of all bodies.
-            self._orientation = body.floating_positions_start()
-            self._velocity = plant.num_positions() + body.floating_velocities_start_in_v()
+            velocity = plant.num_positions() + body.floating_velocities_start_in_v()
+            self.floating_places = body.floating_positions_start(), velocity
             self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         else:
-            self._orientation, self._velocity = 0, 4
             self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
             self._velocities_port = self.DeclareAbstractInputPort(
                 "body_spatial_velocities", Value[list[SpatialVelocity]]()
             )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        return self._sample_into(self._memory.mutable_array(state), context)
+        return self._sample_into(self.memory.mutable_array(state), context)
 
     def _sample_into(self, memory: NDArray[np.float64], context: Context) -> NDArray[np.float64]:
         """Return the measurement; ``memory`` belongs to the last sample, and is overwritten for this one."""
+        orientation, velocity = self.floating_places or (0, 4)
         return sample(
             self._motion(context),
-            orientation=self._orientation,
-            velocity=self._velocity,
-            mount=self._settings.array(context),
-            g_W=self._g_W,
+            orientation=orientation,
+            velocity=velocity,
+            mount=self.settings.array(context),
+            g_W=self.gravity,
             memory=memory,
             period=self.period,
         )
@@ -125,7 +132,7 @@ class Imu(SampledSensor):
         now = context.get_time()
         # The time since the last sample; what is due now has not been sampled yet.
         elapsed = now - (ceil(now / self.period - 1e-6) - 1.0) * self.period
-        memory = self._memory.mutable(context.get_mutable_discrete_state())
+        memory = self.memory.mutable(context.get_mutable_discrete_state())
         memory.sampled = 0.0
         self._sample_into(np.asarray(memory), context)
         R_WF = RotationMatrix(Quaternion(memory.last_orientation))
@@ -134,12 +141,12 @@ class Imu(SampledSensor):
         if angle > 0.0:
             memory.last_orientation = (R_WF @ RotationMatrix(AngleAxis(-angle, turn / angle))).ToQuaternion().wxyz()
             R_WF = R_WF @ RotationMatrix(AngleAxis(-angle / 2.0, turn / angle))
-        memory.last_velocity -= elapsed * (R_WF @ y[3:] + self._g_W)
+        memory.last_velocity -= elapsed * (R_WF @ y[3:] + self.gravity)
 
     def _motion(self, context: Context) -> NDArray[np.float64]:
         """Return numbers that hold q_WB and V_WB."""
-        if self._floating:
+        if self.floating_places is not None:
             x: NDArray[np.float64] = self._state_port.Eval(context)
             return x
-        q_WB = self._poses_port.Eval(context)[self._body].rotation().ToQuaternion().wxyz()
-        return np.concatenate([q_WB, self._velocities_port.Eval(context)[self._body].get_coeffs()])
+        q_WB = self._poses_port.Eval(context)[self.body].rotation().ToQuaternion().wxyz()
+        return np.concatenate([q_WB, self._velocities_port.Eval(context)[self.body].get_coeffs()])
