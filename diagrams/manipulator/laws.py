@@ -1,4 +1,4 @@
-r"""The control laws: joint impedance, Cartesian impedance and admittance.
+r"""The control laws: joint impedance, Cartesian impedance, admittance, and inverse dynamics as a baseline.
 
 q, v are measured; q_r, v_r, a_r and, for the tip T, X_r, V_r, A_r are the reference; ID(q, v, a) = M a + C v + g is
 the arm's inverse dynamics; J is the tip's Jacobian, J+ its pseudo-inverse, N = 1 - J+ J; wrenches and velocities are
@@ -20,6 +20,10 @@ and the arm follows it by its inverse dynamics (resolved acceleration: Luh, Walk
 
     tau = ID(q, v, a) - J' F,   with a the sum of
           J+ (A_r + x'' + D_p (V_r + x' - J v) + K_p (e + x) - Jdot v)   and   N (K_0 (q_r - q) + D_0 (v_r - v))
+
+inverse dynamics (Luh, Walker, Paul, 1980; Drake's ``InverseDynamicsController``, without its integral)
+
+    tau = ID(q, v, a_r + k_p (q_r - q) + k_d (v_r - v))
 
 J+ is of the least squares: N torques do not move the tip of an arm at rest, so that in statics the tip feels K e and
 nothing else.
@@ -124,7 +128,17 @@ def _linear(value: Expression) -> Expression:
     return casadi.vertcat(casadi.SX.zeros(3), value)
 
 
-def _joint_impedance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
+@dataclass(frozen=True)
+class _JointReference:
+    """The reference in joint space: q_r, v_r, a_r, and what the law remembers as its ``reference``."""
+
+    q: Expression
+    v: Expression
+    a: Expression
+    following: Expression
+
+
+def _joint_reference(now: Instant) -> _JointReference:
     # Cartesian motions become joint motions by closed-loop inverse kinematics, from where the reference is. Without the
     # pull to the home pose, an arm with a joint to spare ends each circle in another posture, in the end at its stops.
     model, r, p, last = now.model, now.reference, now.parameters, now.state["reference"]
@@ -134,12 +148,24 @@ def _joint_impedance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
     pull = r.ease * p["posture_rate"] * (p["home"] - last)
     v_c = least.inverse(_linear(r.dv) + p["tracking_rate"] * error) + least.null(pull)
     a_c = least.inverse(_linear(r.da) - model.tip_bias(last, v_c))
-    q_r = casadi.if_else(r.in_joints, r.q, last)
-    v_r = casadi.if_else(r.in_joints, r.v, v_c)
-    a_r = casadi.if_else(r.in_joints, r.a, a_c)
-    tau = p["stiffness"] * (q_r - now.q) + p["damping"] * (v_r - now.v) + model.inverse_dynamics(now.q, now.v, a_r)
-    following = casadi.if_else(r.in_joints, r.q, last + now.period * v_c)
-    return tau, {"reference": following}
+    return _JointReference(
+        q=casadi.if_else(r.in_joints, r.q, last),
+        v=casadi.if_else(r.in_joints, r.v, v_c),
+        a=casadi.if_else(r.in_joints, r.a, a_c),
+        following=casadi.if_else(r.in_joints, r.q, last + now.period * v_c),
+    )
+
+
+def _joint_impedance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
+    p, r = now.parameters, _joint_reference(now)
+    tau = p["stiffness"] * (r.q - now.q) + p["damping"] * (r.v - now.v) + now.model.inverse_dynamics(now.q, now.v, r.a)
+    return tau, {"reference": r.following}
+
+
+def _inverse_dynamics(now: Instant) -> tuple[Expression, dict[str, Expression]]:
+    p, r = now.parameters, _joint_reference(now)
+    a = r.a + p["position_gain"] * (r.q - now.q) + p["velocity_gain"] * (r.v - now.v)
+    return now.model.inverse_dynamics(now.q, now.v, a), {"reference": r.following}
 
 
 def _cartesian(now: Instant) -> tuple[FrameMotion, _Projection, Expression, Expression, Expression, Expression]:
@@ -183,13 +209,16 @@ def _admittance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
 
 
 _SIX = "N m/rad, N/m"
+_JOINT_REFERENCE: Declared = {
+    "tracking_rate": _gain(20.0, "1/s", 10.0),
+    "posture_rate": _gain(4.0, "1/s", 10.0),
+}
 LAWS = {
     "joint_impedance": Law(
         {
             "stiffness": _gain((800.0, 800.0, 600.0, 600.0, 300.0, 150.0, 100.0), "N m/rad", 10.0),
             "damping": _gain((60.0, 60.0, 40.0, 40.0, 20.0, 8.0, 6.0), "N m s/rad", 3.0),
-            "tracking_rate": _gain(20.0, "1/s", 10.0),
-            "posture_rate": _gain(4.0, "1/s", 10.0),
+            **_JOINT_REFERENCE,
         },
         _joint_impedance,
     ),
@@ -212,5 +241,13 @@ LAWS = {
         },
         _admittance,
         {"offset": ((0.0,) * 6, "rad, m"), "offset_rate": ((0.0,) * 6, "rad/s, m/s")},
+    ),
+    "inverse_dynamics": Law(
+        {
+            "position_gain": _gain(900.0, "1/s^2", 10.0),
+            "velocity_gain": _gain(60.0, "1/s", 5.0),
+            **_JOINT_REFERENCE,
+        },
+        _inverse_dynamics,
     ),
 }

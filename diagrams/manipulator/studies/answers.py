@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.studies.trials import (
     DURATIONS,
+    FREE,
     PROGRAM,
     LawAlongX,
     RestingForce,
@@ -31,6 +33,14 @@ from vtbdrake_diagrams.manipulator.studies.trials import (
 )
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
+# The laws that an engineer would take for motions alone -> their gains, which a scale multiplies by its square and
+# by itself. The second is Drake's `InverseDynamicsController`.
+BASELINES = {
+    "joint_impedance": ("stiffness", "damping"),
+    "inverse_dynamics": ("position_gain", "velocity_gain"),
+}
+# The scales among which they are tuned in simulation; the laws of `LAWS` keep their default gains.
+SCALES = (1.0, 1.5, 2.0)
 
 # Masses, friction and other parameters of the machine differ from the DPS's by up to this fraction.
 PERTURB = 0.05
@@ -87,6 +97,40 @@ class Trials:
         return follows and presses and self.identical and self.compared >= COMPARED and not self.latched
 
 
+def best_scale(scores: Mapping[float, float]) -> float:
+    """Return the scale with the least error; NaN is none.
+
+    Args:
+        scores: Scale -> error.
+    """
+    return min(scores, key=lambda scale: np.nan_to_num(scores[scale], nan=np.inf))
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A law for motions alone, tuned in simulation, on the machine.
+
+    Attributes:
+        scores: Scale of the gains -> tracking error of the tip in simulation, RMS, in m.
+        real: The track on the machine, with the best scale.
+        latched: The faults for which the guards latched; empty if they did not.
+    """
+
+    scores: Mapping[float, float]
+    real: Track
+    latched: str
+
+    @property
+    def scale(self) -> float:
+        """Return the scale with the least error in simulation."""
+        return best_scale(self.scores)
+
+    def __str__(self) -> str:
+        error, effort = rms(self.real.errors()), self.real.effort()
+        latched = f", LATCHED: {self.latched}" if self.latched else ""
+        return f"{1e3 * error:.2f} mm, gains x {self.scale:g}, {effort:.0f} N m{latched}"
+
+
 def control(full: bool) -> Answer:
     """Measure how well the arm tracks its motions, on the machine and in simulation.
 
@@ -95,6 +139,7 @@ def control(full: bool) -> Answer:
     """
     trials = {name: _trials(law, full) for name, law in LAWS.items()}
     errors = {name: trial.errors for name, trial in trials.items()}
+    baselines = {law: _baseline(law) for law in BASELINES}
     cycles = sum(trial.compared for trial in trials.values())
     same = "identical" if all(trial.identical for trial in trials.values()) else "DIFFERENT"
     latched = "; ".join(trial.latched for trial in trials.values() if trial.latched)
@@ -107,11 +152,14 @@ def control(full: bool) -> Answer:
         paper="done with a real arm, 1 ms; no figures",
         cases="one program of motions, both control laws, in simulation",
         held_out=f"the same motions on a machine process whose parameters differ by up to {PERTURB:.0%}",
-        baseline="",
+        baseline="for motions alone, on the same machine, tuned in simulation: "
+        + "; ".join(f"{name.replace('_', ' ')} {baseline}" for name, baseline in baselines.items()),
         holds=all(trial.holds for trial in trials.values()),
         note=(
             "in simulation "
             + ", ".join(f"{name} {1e3 * simulated:.2f} mm" for name, (simulated, _) in errors.items())
+            + ". Torque: "
+            + ", ".join(f"{name} {trial.real.effort():.0f} N m" for name, trial in trials.items())
             + ". Force on the wall: "
             + "; ".join(f"{name} {_forces(trial)}" for name, trial in trials.items())
             + f". Commands of testbed and DPS alone: {same} in "
@@ -132,15 +180,9 @@ def _forces(trial: Trials) -> str:
 def _trials(law: str, full: bool) -> Trials:
     scenario = trial_scenario(law)
     testbed, alone = scenario.build(), DpsAlone(scenario)
-    by_the_clock = replace(scenario.deployment(), pace="")
     sent_by_testbed: list[NDArray[np.float64]] = []
     sent_by_dps: list[NDArray[np.float64]] = []
-    with (
-        Hub(port=0) as hub,
-        scenario.deploy(
-            hub.url, target=testbed, values=DURATIONS, deployment=by_the_clock, clock=SimulatedClock()
-        ) as simulation,
-    ):
+    with _simulating(scenario, testbed, DURATIONS) as simulation:
         simulated = run_trial(simulation)
     stripped = alone.continue_from(testbed, simulation.context)
     with _commanding(scenario, testbed, simulation.context, sent_by_testbed) as loop:
@@ -159,6 +201,44 @@ def _trials(law: str, full: bool) -> Trials:
         np.array_equal(sent_by_testbed[:compared], sent_by_dps[:compared]),
         "; ".join(fault.reason for fault in latched),
     )
+
+
+def _baseline(law: str) -> Baseline:
+    scenario = trial_scenario(law)
+    testbed, alone = scenario.build(), DpsAlone(scenario)
+    scores = {}
+    for scale in SCALES:
+        with _simulating(scenario, testbed, DURATIONS | _gains(testbed, law, scale)) as simulation:
+            scores[scale] = rms(run_trial(simulation, FREE).errors())
+    scale = best_scale(scores)
+    context = alone.default_context()
+    alone.write(context, DURATIONS | _gains(testbed, law, scale))
+    with _commanding(scenario, alone, context, []) as loop:
+        track = run_trial(loop, FREE)
+        return Baseline(scores, track, "; ".join(fault.reason for fault in loop.guards.latched))
+
+
+def _gains(testbed: VirtualTestbed, law: str, scale: float) -> dict[str, Any]:
+    """Return the gains of a baseline, as stiff as the square of a scale and as well damped."""
+    stiffness, damping = (f"dps.impl.{name}" for name in BASELINES[law])
+    context = testbed.default_context()
+    return {
+        stiffness: scale**2 * np.asarray(testbed.read(context, stiffness)),
+        damping: scale * np.asarray(testbed.read(context, damping)),
+    }
+
+
+@contextmanager
+def _simulating(scenario: ManipulatorScenario, testbed: VirtualTestbed, values: Mapping[str, Any]) -> Iterator[Runtime]:
+    """Run the loop in its own simulation, as fast as it goes."""
+    by_the_clock = replace(scenario.deployment(), pace="")
+    with (
+        Hub(port=0) as hub,
+        scenario.deploy(
+            hub.url, target=testbed, values=values, deployment=by_the_clock, clock=SimulatedClock()
+        ) as simulation,
+    ):
+        yield simulation
 
 
 @contextmanager

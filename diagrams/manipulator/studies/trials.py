@@ -84,7 +84,7 @@ class Trial:
         return Track.of({name: np.array(values) for name, values in self._samples.items()}, self.parameters)
 
 
-_RECORDED = ("env.joint_position", "env.contact_wrench", "impl.motion", "impl.clock", "impl.start")
+_RECORDED = ("env.joint_position", "env.contact_wrench", "impl.motion", "impl.clock", "impl.start", "impl.torque")
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,7 @@ class Track:
         reference: The reference of the tip, (n, 3), in m, in the world.
         tip: The position of the tip by the measured joint positions, (n, 3), in m.
         force: The force of the environment on the tip, as the DPS perceives it, (n, 3), in N.
+        torque: The torque that the law commands, (n, 7), in N m.
     """
 
     motion: NDArray[np.float64]
@@ -104,6 +105,7 @@ class Track:
     reference: NDArray[np.float64]
     tip: NDArray[np.float64]
     force: NDArray[np.float64]
+    torque: NDArray[np.float64]
 
     @classmethod
     def of(cls, samples: dict[str, NDArray[np.float64]], values: dict[str, Any], *, period: float = 0.001) -> Track:
@@ -113,9 +115,17 @@ class Track:
         columns = [samples["impl.motion"], clock, samples["impl.start"], samples["env.joint_position"]]
         both = [positions(*row) for row in zip(*columns, strict=True)]
         reference_tip, tip = (np.array([pair[k].full().ravel() for pair in both]).reshape(-1, 3) for k in range(2))
-        return cls(
-            samples["impl.motion"], clock, reference_tip, tip, samples["env.contact_wrench"].reshape(-1, 6)[:, 3:]
-        )
+        force = samples["env.contact_wrench"].reshape(-1, 6)[:, 3:]
+        torque = samples["impl.torque"].reshape(-1, JOINTS)
+        return cls(samples["impl.motion"], clock, reference_tip, tip, force, torque)
+
+    def effort(self, motions: Sequence[int] = FREE) -> float:
+        """Return the root mean square of the norm of the torques during some motions, in N m.
+
+        Args:
+            motions: The motions.
+        """
+        return rms(np.linalg.norm(self.torque[np.isin(self.motion, motions)], axis=1))
 
     def errors(self, motions: Sequence[int] = FREE) -> NDArray[np.float64]:
         """Return the distances of the tip from its reference during some motions, shape (k,), in m."""

@@ -7,6 +7,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.controllers import InverseDynamicsController
 from pydrake.systems.framework import Context, Diagram
 
 from vtbdrake.state import Variables, collect
@@ -125,6 +126,24 @@ def test_joint_impedance_is_a_spring_and_a_damper_per_joint(plant: MultibodyPlan
     plant.SetVelocities(context, v)
     bias = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
     np.testing.assert_allclose(bench.step(), bias - K * dq - D * v, atol=1e-6)
+
+
+def test_inverse_dynamics_is_drakes_controller() -> None:
+    robot = MultibodyPlant(0.0)
+    add_arm(robot, ARM)
+    robot.Finalize()
+    k_p, k_d = 400.0, 35.0
+    controller = InverseDynamicsController(
+        robot, np.full(7, k_p), np.zeros(7), np.full(7, k_d), has_reference_acceleration=True
+    )
+    dq, v = 0.005 * np.arange(1.0, 8.0), 0.02 * np.array([1, -1, 1, 1, -1, 1, -1])
+    context = controller.CreateDefaultContext()
+    controller.get_input_port_estimated_state().FixValue(context, [*(HOME + dq), *v])
+    controller.get_input_port_desired_state().FixValue(context, [*HOME, *np.zeros(7)])
+    controller.get_input_port_desired_acceleration().FixValue(context, np.zeros(7))
+    bench = Bench("inverse_dynamics", **{"impl.position_gain": k_p, "impl.velocity_gain": k_d})
+    bench.feed(joint_position=HOME + dq, joint_velocity=v)
+    np.testing.assert_allclose(bench.step(), controller.get_output_port_control().Eval(context), atol=1e-6)
 
 
 def test_cartesian_impedance_is_a_spring_at_the_tip(plant: MultibodyPlant) -> None:

@@ -68,12 +68,21 @@ def test_the_resting_force_is_felt_at_the_end_of_the_wait() -> None:
     reference, force = np.zeros((len(clock), 3)), np.zeros((len(clock), 3))
     reference[:, 0], force[:, 0] = along_x, -felt
     motion = np.full(len(clock), float(Motion.PRESS))
-    track = Track(motion, clock, reference, reference, force)
+    track = Track(motion, clock, reference, reference, force, np.zeros((len(clock), 7)))
     K, k = 500.0, SCENARIO.wall_stiffness
     pressing = track.pressing(LawAlongX(8.0, 160.0, K), SCENARIO)
     assert pressing.predicted == pytest.approx(0.04 * K * k / (K + k))
     assert pressing.felt == pytest.approx(21.0, abs=2.0)
     assert pressing.error == pytest.approx(21.0 / pressing.predicted - 1.0, abs=0.1)
+
+
+def test_the_effort_is_of_the_motions_that_are_asked_for() -> None:
+    motion = np.array([Motion.SWING, Motion.PRESS, Motion.CIRCLE], dtype=float)
+    torque = np.zeros((3, 7))
+    torque[:, :2] = [[3.0, 4.0], [60.0, 80.0], [0.0, 1.0]]
+    rest = np.zeros((3, 3))
+    track = Track(motion, np.zeros(3), rest, rest, rest, torque)
+    assert track.effort() == pytest.approx(np.sqrt((5.0**2 + 1.0) / 2.0))
 
 
 def test_trial_that_does_not_end_is_told() -> None:
