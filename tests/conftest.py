@@ -92,12 +92,18 @@ ONE_PYTHON = ("cli", "diagrams/forest", "notebooks", "visualization")
 
 
 # A worker runs a file as a whole: with those that take longest at the start, all workers end at about the same time.
-FIRST = ("test_docs.py", "notebooks/test_notebooks.py", "project/test_projects.py", "web/live/test_page.py")
+FIRST = (
+    "test_docs.py",
+    "notebooks/test_notebooks.py",
+    "project/test_projects.py",
+    "web/live/test_page.py",
+    "diagrams/test_checks.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    first = {Path(__file__).parent / name for name in FIRST}
-    items.sort(key=lambda item: item.path not in first)  # It keeps the order otherwise.
+    first = {Path(__file__).parent / name: k for k, name in enumerate(FIRST)}
+    items.sort(key=lambda item: first.get(item.path, len(first)))  # It keeps the order otherwise.
     folders = [Path(__file__).parent / name for name in ONE_PYTHON]
     files = {item.path for item in items}
     one_python = {path for path in files if any(folder in path.parents for folder in folders)}
