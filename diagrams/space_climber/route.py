@@ -33,6 +33,9 @@ HALF_WIDTH = 0.45
 CLEARANCE = 0.1
 """Height up to which the robot steps over a rock, in m."""
 
+WIDEST = np.radians(45.0)
+"""Azimuth to either side of x up to which the question asks for a way; beside it, a metre costs `STEEPEST` more."""
+
 GOAL_RADIUS = RIM_RADIUS + 2.0
 """Distance from the axis at which a route ends, in m."""
 
@@ -100,6 +103,8 @@ def route(terrain: BelievedTerrain) -> Route:
             reach = 0.5 * rock.number("width", unit="m") + HALF_WIDTH
             x, y = rock.p_WoOo_W[:2]
             price[np.hypot(places[0] - x, places[1] - y) < reach] += ROCK_COST
+    # Near the axis, where it starts, the robot may be anywhere.
+    price[(np.abs(np.arctan2(places[1], places[0])) > WIDEST) & (np.hypot(*places) > 5.0)] += STEEPEST
     return Route(ground.origin, _costs(price, np.hypot(*places) > GOAL_RADIUS))
 
 

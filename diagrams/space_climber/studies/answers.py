@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import ceil, isfinite
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from vtbdrake.optimization import Boundary
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.studies import crater
+from vtbdrake_diagrams.space_climber.studies import crater, perceived
 from vtbdrake_diagrams.space_climber.studies.other_engine import CONTACTS, MujocoClimber
 from vtbdrake_diagrams.space_climber.studies.payload import (
     EARTH,
@@ -36,9 +36,9 @@ SECOND_ENGINE = (MOON, EARTH, SLOPE)
 MUJOCO_MASSES = (20.0, 60.0)
 # How far the boundaries of one environment in MuJoCo may be apart, in kg: a wider interval would agree with anything.
 LARGEST_SPREAD = 6.0
-# From how many samples of its belief the robot in the crater tries each heading.
-SAMPLES = 3
-# The share of the craters in which the robot must reach the rim, and by how much more than straight on.
+# In how many craters the robot is judged, the share in which it must reach the rim, and by how much more than the best
+# baseline.
+LEAST_CRATERS = 100
 LEAST_REACHED = 0.9
 LEAST_GAIN = 0.2
 
@@ -175,106 +175,88 @@ def _range(boundary: Boundary) -> str:
 
 @dataclass(frozen=True)
 class HeadingAnswer:
-    """Decisions and climbs of the robot in each crater.
+    """The walks of all strategies in the craters that are judged, and whether those that were repeated end the same.
 
     Attributes:
-        cases: The robot's decision among discrete headings in each crater, with the climb straight on beside it.
-        searched: Its decisions by a continuous search; empty if not asked for.
-        reasons: Crater -> heading that does not pass in the model, in rad -> why, see `crater.explain`.
+        crossings: The passable craters in which all strategies have walked, see `perceived.judged`.
+        repeated: Name of a walk that was repeated -> whether it ended as in the file.
     """
 
-    cases: tuple[crater.Case, ...]
-    searched: tuple[crater.Case, ...]
-    reasons: Mapping[int, Mapping[float, list[str]]]
+    crossings: tuple[perceived.Crossing, ...]
+    repeated: Mapping[str, bool]
+
+    def reached(self, strategy: str) -> int:
+        """Return in how many craters a strategy reaches the rim; a robot that stands still has not."""
+        return sum(crossing.walks[strategy].reached for crossing in self.crossings)
 
     @property
-    def explained(self) -> bool:
-        """Return whether there is a reason for each heading that does not pass."""
-        return all(all(texts.values()) for texts in self.reasons.values())
+    def baseline(self) -> str:
+        """Return the best strategy that does not look."""
+        return max(perceived.COMPARED[1:], key=self.reached)
 
     @property
-    def warned(self) -> bool:
-        """Return whether a decision says of itself that it is poor."""
-        return any(case.decision.poor for case in [*self.cases, *self.searched])
-
-    @property
-    def straight(self) -> int:
-        """Return in how many craters the robot reaches the rim straight on."""
-        return sum(case.straight is not None and case.straight.reached for case in self.cases)
+    def refused(self) -> int:
+        """Return in how many craters the robot stood still and said why."""
+        walks = [crossing.walks[perceived.COMPARED[0]] for crossing in self.crossings]
+        return sum(bool(walk.stops) and walk.stops[-1].heading is None for walk in walks)
 
     @property
     def holds(self) -> bool:
-        """Return whether decisions reach the rim often enough, and more often than without one; none is a miss."""
-        reached = sum(case.reached for case in self.cases)
-        enough = LEAST_REACHED * len(self.cases)
-        better = reached - self.straight >= LEAST_GAIN * len(self.cases)
-        searched = sum(case.reached for case in self.searched) >= LEAST_REACHED * len(self.searched)
-        return bool(self.cases) and reached >= enough and better and searched and self.explained and not self.warned
+        """Return whether decisions reach the rim often enough, and more often than the best baseline, in 100 craters.
+
+        A refusal is a miss. Walks that were repeated must end as before.
+        """
+        count, reached = len(self.crossings), self.reached(perceived.COMPARED[0])
+        better = reached - self.reached(self.baseline) >= LEAST_GAIN * count
+        return count >= LEAST_CRATERS and reached >= LEAST_REACHED * count and better and all(self.repeated.values())
 
 
 def heading(full: bool) -> Answer:
     """Answer R1: which heading takes the robot from the bottom of a crater to its rim?
 
-    The short version decides among the paper's discrete headings in 10 craters, each in a world that differs from the
-    robot's model. The long one takes 20, and decides by a continuous search, too. Failing headings are explained in the
-    first crater (in the long version in each), and wherever the robot sees no way: a start or a simulation that lets no
-    robot walk must not pass for an impassable crater.
+    The robot has a survey, looks, and decides at each stop, see `perceived`. The walks are kept in a file; its program
+    adds some. The short version repeats one of them, a baseline's; the long one a tenth, the robot's own among them.
     """
-    cases = [
-        crater.decide_and_climb(seed, difference=seed, baseline=True, samples=SAMPLES)
-        for seed in range(20 if full else 10)
-    ]
-    searched = [
-        crater.decide_and_climb(case.seed, difference=case.seed, method="CEM", candidates=24, samples=SAMPLES)
-        for case in cases
-        if full
-    ]
-    reasons = {case.seed: _reasons(case) for case in cases if full or case is cases[0] or case.climb is None}
-    result = HeadingAnswer(tuple(cases), tuple(searched), reasons)
-    notes = [
-        "; ".join(_climb(case) for case in cases),
-        f"headings that do not pass: {'; '.join(_reasons_text(seed, texts) for seed, texts in reasons.items())}",
-    ]
-    if full:
-        notes.append(f"continuous search: {'; '.join(_climb(case) for case in searched)}")
-    heading_deg = np.degrees(cases[0].decision.values.get(crater.HEADING, np.nan))
-    reached = sum(case.reached for case in cases)
+    walks = perceived.load()
+    cases = perceived.judged(walks)
+    result = HeadingAnswer(cases, _repeated(cases, full=full))
+    reached = {strategy: result.reached(strategy) for strategy in perceived.COMPARED}
+    missed = [case for case in cases if not case.walks[perceived.COMPARED[0]].reached]
+    reasons = [f"crater {case.seed}: {case.walks[perceived.COMPARED[0]].reason}" for case in missed]
+    older = perceived.older()
+    impassable = sum(crossing.passable is False for crossing in perceived.crossings(walks))
     return Answer(
         id="R1",
         question="Which heading takes the robot from the bottom of a crater to its rim?",
-        answer=f"{heading_deg:.0f} deg in crater 0; the rim reached in {reached} of {len(cases)} craters",
+        answer=f"decided at each stop; the rim reached in {reached[perceived.COMPARED[0]]} of {len(cases)} craters",
         unit="",
         interval=None,
         paper=crater.PAPER,
-        cases=f"the robot's models of {len(cases)} craters",
-        held_out="worlds that differ from these models in ground, friction and mass",
-        baseline=f"straight on, without a decision, {result.straight} of {len(cases)}",
-        refused=sum(case.climb is None for case in cases),
+        cases=f"craters below {perceived.FIRST_SEED}",
+        held_out=f"{len(cases)} craters in which some fixed heading passes; {LEAST_CRATERS} are asked for",
+        baseline=", ".join(f"{strategy} {reached[strategy]}" for strategy in perceived.COMPARED[1:]),
+        refused=result.refused,
         holds=result.holds,
-        note=". ".join(notes),
+        note=(
+            f"No fixed heading passes in {impassable} more. Missed: {'; '.join(reasons) or 'none'}. Repeated: "
+            f"{', '.join(f'{name}, {_same(same)}' for name, same in result.repeated.items()) or 'none'}. "
+            f"{older} of the {len(walks)} walks are by an older version of the program."
+        ),
     )
 
 
-def _climb(case: crater.Case) -> str:
-    passable = [f"{np.degrees(angle):.0f}" for angle, passes in sorted(case.passable.items()) if passes]
-    text = f"crater {case.seed}: passable {', '.join(passable) or 'none'}"
-    if case.decision.poor:
-        text += f" (POOR: {'; '.join(case.decision.warnings)})"
-    if case.climb is None:
-        return text
-    heading_deg, climb = np.degrees(case.climb.heading), case.climb
-    end = (
-        f"reached the rim in {climb.duration:.0f} s" if climb.reached else f"ended {climb.distance:.0f} m from the axis"
-    )
-    return f"{text}; {heading_deg:.0f} deg {end}"
+def _same(same: bool) -> str:
+    return "as in the file" if same else "ANOTHER END"
 
 
-def _reasons(case: crater.Case) -> dict[float, list[str]]:
-    """Return why headings do not pass in the robot's model, see `crater.explain`."""
-    failing = [angle for angle, passes in sorted(case.passable.items()) if not passes]
-    return crater.explain(crater.model(case.seed), failing)
-
-
-def _reasons_text(seed: int, reasons: dict[float, list[str]]) -> str:
-    texts = [f"{np.degrees(angle):.0f} deg {' or '.join(names) or 'UNEXPLAINED'}" for angle, names in reasons.items()]
-    return f"crater {seed}: {', '.join(texts) or 'none'}"
+def _repeated(cases: Sequence[perceived.Crossing], *, full: bool) -> dict[str, bool]:
+    """Return whether walks that are drawn at random end as in the file: one in the short version, else a tenth."""
+    rng = np.random.default_rng()
+    count = ceil(0.1 * len(cases)) if full else min(1, len(cases))
+    strategies = perceived.COMPARED if full else ("straight",)
+    repeated = {}
+    for case in rng.choice(np.arange(len(cases)), count, replace=False):
+        seed, site = cases[case].seed, perceived.Site(cases[case].seed)
+        for strategy in strategies:
+            repeated[f"{strategy} in crater {seed}"] = site.run(strategy).reached == cases[case].walks[strategy].reached
+    return repeated

@@ -255,33 +255,19 @@ class Case:
         seed: Seed of the crater.
         decision: The decision of the robot.
         climb: The climb in the world; None if the robot found no way to the rim.
-        straight: The climb straight on in the same world, without a decision: the baseline; None if not tried.
     """
 
     seed: int
     decision: Decision
     climb: Climb | None
-    straight: Climb | None = None
-
-    @property
-    def reached(self) -> bool:
-        """Return whether the robot has reached the rim by its decision; a robot that sees no way has not."""
-        return self.climb is not None and self.climb.reached
-
-    @property
-    def passable(self) -> dict[float, bool]:
-        """Return for each heading that was tried (rad) whether it passes the rim in its mental rollouts."""
-        tried = [candidate for candidate in self.decision.candidates if candidate.rollouts]
-        return {float(c.values[HEADING]): all(map(passes, c.rollouts)) for c in tried}
 
 
-def decide_and_climb(seed: int, difference: int, *, baseline: bool = False, **options: Any) -> Case:
+def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
     """Let the robot decide in the crater ``seed`` and walk in a world that differs.
 
     Args:
         seed: Seed of the crater.
         difference: Difference of the world, see `differing`.
-        baseline: Whether it also walks straight on, in the same world.
         options: Options of `heading_reasoner`.
     """
     expedition = Expedition(differing(seed, difference))
@@ -289,8 +275,7 @@ def decide_and_climb(seed: int, difference: int, *, baseline: bool = False, **op
         decision = expedition.decide(reasoner)
     promising = decision.chosen is not None and all(map(passes, decision.candidates[decision.chosen].rollouts))
     climb = expedition.climb(float(decision.values[HEADING])) if promising else None
-    straight = Expedition(differing(seed, difference)).climb(0.0) if baseline else None
-    return Case(seed, decision, climb, straight)
+    return Case(seed, decision, climb)
 
 
 @click.command()

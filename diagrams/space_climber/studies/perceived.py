@@ -25,6 +25,7 @@ from typing import Any
 
 import click
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlantConfig
@@ -39,7 +40,7 @@ from vtbdrake_diagrams.space_climber.believed_scenario import BelievedCraterScen
 from vtbdrake_diagrams.space_climber.believed_terrain import FRICTION, BelievedTerrain, NoReturnError
 from vtbdrake_diagrams.space_climber.crater_scenario import ENDS, PASSED, X_BL, CraterScenario
 from vtbdrake_diagrams.space_climber.ground_map import OffTheMapError
-from vtbdrake_diagrams.space_climber.route import Route, route
+from vtbdrake_diagrams.space_climber.route import CLEARANCE, Route, route
 from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, MASS, POSE, WALK, differing
 from vtbdrake_diagrams.space_climber.survey import survey
 from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS
@@ -503,6 +504,14 @@ def load(path: Path = RESULTS) -> tuple[Walk, ...]:
     return tuple(walks)
 
 
+def older(path: Path = RESULTS) -> int:
+    """Return how many walks of a file are by another version of the program, by its digest."""
+    if not path.exists():
+        return 0
+    present, lines = digest(), path.read_text(encoding="utf-8").splitlines()
+    return sum(json.loads(line).get("digest") != present for line in lines)
+
+
 def _read_walk(record: Mapping[str, Any]) -> Walk:
     stops = tuple(
         Stop(stop["time"], tuple(stop["place"]), stop["heading"], tuple(map(tuple, stop["tried"])), stop["said"])
@@ -512,12 +521,42 @@ def _read_walk(record: Mapping[str, Any]) -> Walk:
     return Walk(**{**values, "end": tuple(record["end"]), "stops": stops})
 
 
+def draw(walk: Walk) -> Figure:
+    """Draw a walk on the true crater: what was surveyed, where the robot stopped, and what it tried there.
+
+    Args:
+        walk: A walk with stops, from a file of results.
+    """
+    site = Site(walk.seed)
+    crater, figure = site.world.crater, Figure(figsize=(8.0, 7.0), layout="constrained")
+    axes = figure.add_subplot(xlabel="x in m", ylabel="y in m", aspect="equal")
+    vertices = site.terrain.ground.vertices()
+    shape = (*site.terrain.ground.survey.shape, 2)
+    x, y = np.moveaxis(vertices.reshape(shape), -1, 0)
+    lines = axes.contour(x, y, crater.height(x, y), levels=np.arange(0.5, 6.5, 0.5), cmap="copper", linewidths=0.7)
+    axes.clabel(lines, fontsize=7)
+    large = [block for block in crater.blocks if block.size[2] > 2.0 * CLEARANCE]
+    axes.plot([b.x for b in large], [b.y for b in large], "k.", markersize=3, label="rocks higher than 0.1 m")
+    listed = site.terrain.rocks.positions()
+    axes.plot(*listed[:, :2].T, "s", color="tab:red", markersize=5, fillstyle="none", label="boulders of the survey")
+    for stop in walk.stops:
+        for heading, gain in stop.tried:
+            end = np.array(stop.place[:2]) + max(gain, 0.0) * np.array([np.cos(heading), np.sin(heading)])
+            axes.plot(*np.column_stack([stop.place[:2], end]), color="tab:blue", alpha=0.4, linewidth=1.0)
+    places = np.array([*(stop.place[:2] for stop in walk.stops), walk.end[:2]])
+    axes.plot(*places.T, "o-", color="tab:blue", markersize=4, label="stops; tried headings, as long as they gain")
+    axes.legend(loc="lower right", fontsize=8)
+    axes.set_title(f"crater {walk.seed}: {_summary(walk)}", fontsize=9)
+    return figure
+
+
 @click.command()
 @click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first crater.")
 @click.option("--count", default=1, show_default=True, help="Number of craters.")
 @click.option("--file", default=str(RESULTS), show_default=True, help="File of results, to which walks are added.")
+@click.option("--figure", default="", help="File of a picture of the first crater's reasoned walk, if there is one.")
 @click.option("--strategy", "strategies", multiple=True, default=STRATEGIES, show_default=True, help="What to compare.")
-def main(first: int, count: int, file: str, strategies: tuple[str, ...]) -> None:
+def main(first: int, count: int, file: str, figure: str, strategies: tuple[str, ...]) -> None:
     """Let the robot find its way out of craters, and compare strategies; walks of the file are not repeated."""
     path = Path(file)
     for seed in range(first, first + count):
@@ -532,6 +571,9 @@ def main(first: int, count: int, file: str, strategies: tuple[str, ...]) -> None
         crossing = next(each for each in crossings(load(path)) if each.seed == seed)
         for name, walk in crossing.walks.items():
             click.echo(f"crater {seed}, {name}: {_summary(walk)}")
+    pictured = [walk for walk in load(path) if walk.seed == first and walk.strategy == "reasoned"]
+    if figure and pictured:
+        draw(pictured[0]).savefig(figure, dpi=110)
     cases = judged(load(path))
     for strategy in COMPARED:
         count_reached = sum(case.walks[strategy].reached for case in cases)

@@ -4,14 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import inf, nan
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from vtbdrake.optimization import Boundary
-from vtbdrake.reasoning import Decision
 from vtbdrake_diagrams.space_climber.studies.answers import HeadingAnswer, PayloadAnswer
-from vtbdrake_diagrams.space_climber.studies.crater import Case, Climb
+from vtbdrake_diagrams.space_climber.studies.perceived import (
+    COMPARED,
+    FIRST_SEED,
+    HEADINGS,
+    Crossing,
+    Stop,
+    Walk,
+    crossings,
+    digest,
+    heading_name,
+    judged,
+    load,
+    older,
+    save,
+)
 
 pytestmark = pytest.mark.one_python
 
@@ -63,38 +77,70 @@ def test_each_part_of_the_mass_can_fail(change: dict[str, object]) -> None:
     assert not replace(HEAVY, **change).holds
 
 
-def case(seed: int, reached: bool, *, straight: bool, climbs: bool = True, warnings: tuple[str, ...] = ()) -> Case:
-    def climb(reached: bool) -> Climb:
-        return Climb(heading=0.0, reached=reached, elevation=1.0, duration=100.0, distance=9.0)
-
-    decision = Decision.__new__(Decision)  # Only its warnings matter here.
-    object.__setattr__(decision, "warnings", warnings)
-    return Case(seed, decision, climb(reached) if climbs else None, climb(straight))
+def walk(seed: int, strategy: str, reached: bool, *, stands: bool = False) -> Walk:
+    stop = Stop(4.0, (0.0, 0.0, 0.2), None if stands else 0.3)
+    return Walk(seed, strategy, reached, 300.0, (41.5, 0.0, 6.2), "", (stop,) if strategy == "reasoned" else ())
 
 
-def cases(reached: int, straight: int, refused: int = 0) -> tuple[Case, ...]:
-    """Return ten cases; the first ones reach the rim, decided or straight on; the last ones see no way."""
-    return tuple(case(k, k < reached, straight=k < straight, climbs=k < 10 - refused) for k in range(10))
+def craters(reasoned: int, baseline: int, *, count: int = 100, refused: int = 0) -> tuple[Crossing, ...]:
+    """Return craters; in the first ones a strategy reaches the rim; in the last ones the robot stands still."""
+    crossings = []
+    for k in range(count):
+        walks = {name: walk(k, name, k < baseline) for name in ("surveyed route", "least slope", "straight")}
+        walks["reasoned"] = walk(k, "reasoned", k < min(reasoned, count - refused), stands=k >= count - refused)
+        crossings.append(Crossing(FIRST_SEED + k, walks))
+    return tuple(crossings)
 
 
-WAY = HeadingAnswer(cases(9, 7), cases(9, 0), {0: {0.3: ["boulders"]}})
+WAY = HeadingAnswer(craters(90, 70), {"straight in crater 1003": True})
 
 
 def test_decisions_that_reach_the_rim_hold() -> None:
-    assert (WAY.straight, WAY.holds) == (7, True)
+    assert (WAY.reached("straight"), WAY.holds) == (70, True)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"cases": cases(8, 5)},
-        {"cases": cases(9, 8)},
-        {"cases": cases(9, 5, refused=2)},
-        {"cases": ()},
-        {"searched": cases(8, 0)},
-        {"reasons": {0: {0.3: []}}},
-        {"cases": (*cases(9, 5)[:9], case(9, True, straight=False, warnings=("no budget",)))},
+        {"crossings": craters(89, 60)},
+        {"crossings": craters(90, 71)},
+        {"crossings": craters(100, 60, refused=11)},
+        {"crossings": craters(99, 60, count=99)},
+        {"crossings": ()},
+        {"repeated": {"straight in crater 1003": False}},
     ],
 )
 def test_each_part_of_the_heading_can_fail(change: dict[str, object]) -> None:
     assert not replace(WAY, **change).holds
+
+
+def test_refusals_are_counted() -> None:
+    assert HeadingAnswer(craters(100, 60, refused=11), {}).refused == 11
+
+
+def test_walks_are_kept_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "walks.jsonl"
+    assert load(path) == ()
+    walks = [walk(1001, "reasoned", True), walk(1000, "straight", False)]
+    for each in walks:
+        save(each, path)
+    assert load(path) == tuple(walks)
+    assert older(path) == 0
+    path.write_text(path.read_text().replace(digest(), "another", 1))
+    assert older(path) == 1
+    path.write_text(path.read_text() + "{}\n")
+    with pytest.raises(ValueError, match="line 3 of .* is no walk"):
+        load(path)
+
+
+def test_a_crater_is_judged_when_some_fixed_heading_passes_and_all_have_walked() -> None:
+    names = [heading_name(heading) for heading in HEADINGS]
+    failing = [walk(1000, name, False) for name in (*names, *COMPARED)]
+    (impassable,) = crossings(failing)
+    assert impassable.passable is False
+    (open_question,) = crossings([each for each in failing if each.strategy != "45 deg"])
+    assert open_question.passable is None
+    passing = [walk(1000, name, name == "45 deg") for name in (*names, *COMPARED)]
+    assert len(judged(passing)) == 1
+    assert judged(failing) == judged([each for each in passing if each.strategy != "least slope"]) == ()
+    assert judged([replace(each, seed=FIRST_SEED - 1) for each in passing]) == ()

@@ -1,0 +1,110 @@
+"""Question R1 from perception to action: a robot decides at a stop, or stands still and says why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from vtbdrake.common.scan import Scan
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake_diagrams.space_climber import CraterScenario
+from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
+from vtbdrake_diagrams.space_climber.ground_map import GroundMap
+from vtbdrake_diagrams.space_climber.studies import perceived
+from vtbdrake_diagrams.space_climber.studies.perceived import (
+    HEADINGS,
+    LEAST_GAIN,
+    LOOKING,
+    Explorer,
+    Rover,
+    Site,
+    least_slope,
+    true_world,
+)
+from vtbdrake_diagrams.space_climber.survey import survey
+
+
+def terrain(heights: np.ndarray) -> BelievedTerrain:
+    ground = GroundMap.surveyed((-6.0, -34.0), 1.0, heights, deviation=0.3, range=8.0)
+    return BelievedTerrain(ground, WorldModel())
+
+
+FLAT = np.zeros((55, 69))
+
+
+def standing(place: list[float], scan: Scan) -> SimpleNamespace:
+    """Return a stand-in for a `Rover`, with a scan."""
+    return SimpleNamespace(time=4.0, place=np.array(place), scan=lambda: scan, X_WL=lambda _: RigidTransform())
+
+
+@pytest.mark.parametrize(
+    ("place", "scan", "reason"),
+    [
+        ([0.0, 0.0], Scan.empty(), "no return"),
+        ([0.0, 0.0], Scan(np.array([[0.0, 1.0, 0.0]]), np.array([30.0]), np.zeros(1), 0.0), "no return within"),
+    ],
+)
+def test_a_robot_that_sees_nothing_stands_still_and_says_why(place: list[float], scan: Scan, reason: str) -> None:
+    stop = Explorer(CraterScenario(), terrain(FLAT)).decide(standing(place, scan))
+    assert stop.heading is None
+    assert reason in stop.said
+
+
+def test_a_robot_beside_its_map_stands_still_and_says_why() -> None:
+    rover = standing([-20.0, 0.0], Scan.empty())
+    rover.X_WL = lambda believed: RigidTransform([0.0, 0.0, float(believed.ground.height([rover.place])[0])])
+    stop = Explorer(CraterScenario(), terrain(FLAT)).decide(rover)
+    assert stop.heading is None
+    assert "beside the map" in stop.said
+
+
+def test_the_least_steep_heading_is_chosen_by_the_survey() -> None:
+    """A wall of 1 m per metre from x = 20 m on, but for y > 12 m."""
+    heights = FLAT.copy()
+    heights[26:, :46] = np.arange(29.0)[:, None]
+    assert np.degrees(least_slope(terrain(heights))) > 30.0
+    assert least_slope(terrain(FLAT)) in HEADINGS
+
+
+def test_unknown_strategies_are_named() -> None:
+    with pytest.raises(ValueError, match="a strategy is one of reasoned, .*, not 'luck'"):
+        Site(1).run("luck")
+
+
+def test_worlds_differ_from_what_the_robot_uses() -> None:
+    """Nothing of the true crater is among the fields of the mental world."""
+    world = true_world(7)
+    prior = survey(world.crater, seed=0)
+    mental = Explorer(world, BelievedTerrain(prior.ground, prior.rocks)).mental([0.0, 0.0])
+    untouched = CraterScenario()
+    for name in ("seed", "rock_cover", "waviness", "waviness_seed", "scans"):
+        assert getattr(mental, name) == getattr(untouched, name)
+        assert name in ("scans", "rock_cover") or getattr(world, name) != getattr(untouched, name)
+    assert mental.friction == pytest.approx(0.54)
+
+
+@pytest.mark.slow
+@pytest.mark.one_python
+def test_a_robot_looks_tries_and_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceived, "TRIED", 8.0)
+    world = replace(true_world(1), boulders=False)
+    rover = Rover(world.build(), mass=1.0)
+    prior = survey(world.crater, seed=0)
+    explorer = Explorer(world, BelievedTerrain(prior.ground, prior.rocks))
+    before = np.abs(explorer.terrain.ground.height([[4.0, 0.0]])[0] - explorer.terrain.ground.height([[0.0, 0.0]])[0])
+    rover.advance(LOOKING, walk=0.0)
+    stop = explorer.decide(rover)
+    after = np.abs(explorer.terrain.ground.height([[4.0, 0.0]])[0] - explorer.terrain.ground.height([[0.0, 0.0]])[0])
+    # The floor is flat, and the survey's error of 0.3 m is not there where it has looked.
+    assert after < min(before, 0.15)
+    assert stop.said == ""
+    gains = dict(stop.tried)
+    assert stop.heading == max(gains, key=gains.__getitem__)
+    assert gains[stop.heading] > LEAST_GAIN
+    rover.advance(12.0, heading=stop.heading, walk=1.0)
+    way = rover.place
+    assert np.arctan2(way[1], way[0]) == pytest.approx(stop.heading, abs=0.5)
