@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -68,14 +69,18 @@ class LeverMap:
         drawn = axes.contourf(self.levers, self.stances, self.limits, levels=12, cmap="viridis")
         figure.colorbar(drawn, label="stable up to (kg)")
         for i, j in itertools.product(range(self.stances.size), range(self.levers.size)):
-            axes.annotate(f"{self.limits[i, j]:g}", (self.levers[j], self.stances[i]), color="white", ha="center")
+            box = {"boxstyle": "round", "facecolor": "white", "alpha": 0.8}
+            place = self.levers[j], self.stances[i]
+            axes.annotate(f"{self.limits[i, j]:g}", place, ha="center", va="center", bbox=box)
         if self.limits.min() < PAPER_MASS < self.limits.max():
             line = axes.contour(self.levers, self.stances, self.limits, levels=[PAPER_MASS], colors="tab:red")
             axes.clabel(line, fmt=f"{PAPER_MASS:g} kg (paper)")
         nominal = Morphology()
-        axes.plot(nominal.attachment_x, nominal.stance_x, "o", mec="white", mfc="none", ms=22)
+        axes.plot(nominal.attachment_x, nominal.stance_x, "o", mec="white", mfc="none", mew=2, ms=30)
         axes.set(xlabel="lever of the component (m)", ylabel="front feet ahead of the centre (m)")
-        axes.margins(0.08)
+        for limit, values in ((axes.set_xlim, self.levers), (axes.set_ylim, self.stances)):
+            margin = 0.08 * float(np.ptp(values))
+            limit(float(values.min()) - margin, float(values.max()) + margin)
         return figure
 
 
@@ -110,7 +115,7 @@ def main(out: Path) -> None:
     result = lever_map(echo=lambda line: click.echo(line, err=True))
     header = ("front feet (m)", *(f"lever {lever:g} m" for lever in result.levers), f"{PAPER_MASS:g} kg at (m)")
     rows = [
-        (f"{stance:g}", *(f"{limit:g} kg" for limit in row), f"{lever:.2f}")
+        (f"{stance:g}", *(f"{limit:g} kg" for limit in row), "none" if isnan(lever) else f"{lever:.2f}")
         for stance, row, lever in zip(result.stances, result.limits, result.lever_of(PAPER_MASS), strict=True)
     ]
     click.echo(table(header, rows))

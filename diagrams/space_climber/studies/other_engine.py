@@ -291,6 +291,18 @@ class MujocoClimber:
         return next(falls, inf)
 
 
+def base_motion(qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the orientation (wxyz) and the velocities [angular; linear] of the base in the world, shape (10,).
+
+    Args:
+        qpos: MuJoCo's positions, which begin with the base's position and orientation.
+        qvel: MuJoCo's velocities, which begin with the linear one in the world and the angular one in the base's frame.
+    """
+    q = qpos[3:7] / np.linalg.norm(qpos[3:7])
+    R_WB = RotationMatrix(Quaternion(*q)).matrix()
+    return np.concatenate([q, R_WB @ qvel[3:6], qvel[:3]])
+
+
 class _World:
     """The robot in MuJoCo, with the sensors of the testbed."""
 
@@ -331,13 +343,9 @@ class _World:
         return np.concatenate([self._data.qpos[:3], RollPitchYaw(Quaternion(w, x, y, z)).vector()])
 
     def _imu(self, memory: NDArray[np.float64]) -> NDArray[np.float64]:
-        q, v = self._data.qpos[3:7], self._data.qvel
-        R_WB = RotationMatrix(Quaternion(*(q / np.linalg.norm(q)))).matrix()
-        # MuJoCo has the angular velocity in the body's frame.
-        motion = np.concatenate([q, R_WB @ v[3:6], v[:3]])
         return np.asarray(
             sample(
-                motion,
+                base_motion(self._data.qpos, self._data.qvel),
                 orientation=0,
                 velocity=4,
                 mount=np.zeros(6),

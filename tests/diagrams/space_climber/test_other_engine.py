@@ -14,7 +14,7 @@ from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, Morphology
 from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload
 from vtbdrake_diagrams.space_climber.studies.levers import LeverMap
-from vtbdrake_diagrams.space_climber.studies.other_engine import MujocoClimber, Walk, climber_mjcf
+from vtbdrake_diagrams.space_climber.studies.other_engine import MujocoClimber, Walk, base_motion, climber_mjcf
 from vtbdrake_diagrams.space_climber.studies.payload import MASS
 
 LOAD = 30.0
@@ -44,6 +44,15 @@ def test_inertia_and_gravity_are_those_of_drakes_model() -> None:
     np.testing.assert_allclose(M[np.ix_(other, other)], plant.CalcMassMatrix(context)[np.ix_(drake, drake)], atol=1e-8)
     gravity = plant.CalcGravityGeneralizedForces(context)[drake]
     np.testing.assert_allclose(-data.qfrc_bias[other], gravity, atol=1e-8)
+
+
+def test_the_imu_sees_the_angular_velocity_in_the_world() -> None:
+    # A quarter turn about x: the base's y is the world's z, and its z the world's -y.
+    qpos = np.array([1.0, 2.0, 3.0, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+    qvel = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+    motion = base_motion(qpos, qvel)
+    np.testing.assert_allclose(motion[:4], qpos[3:])
+    np.testing.assert_allclose(motion[4:], [1.0, -3.0, 2.0, 0.1, 0.2, 0.3], atol=1e-12)
 
 
 def drakes_pose(scenario: SpaceClimberScenario, mass: float, time: float) -> np.ndarray:
