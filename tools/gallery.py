@@ -27,6 +27,7 @@ from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.plain.scenario import PlainScenario
+from vtbdrake_diagrams.quadruped import QuadrupedScenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.station.scenario import ArmStation
@@ -35,6 +36,8 @@ FOLDER = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 SKY, SPACE, MARS = (0.80, 0.88, 0.96), (0.02, 0.02, 0.04), (0.86, 0.72, 0.58)
 
 SWUNG = {f"sim.sys.pendulum.{joint}.position": angle for joint, angle in (("shoulder", 0.7), ("elbow", -1.1))}
+
+PUSHED = {"sim.env.push.impulse": (0.0, 20.0, 0.0)}
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Shot:
     eye: tuple[float, float, float]  # m, relative to the target
     target: str  # a body
     background: tuple[float, float, float] = SKY
-    values: Mapping[str, float] = field(default_factory=dict)  # of variables, at the begin
+    values: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)  # of variables, at the begin
 
 
 SHOTS = {
@@ -55,6 +58,7 @@ SHOTS = {
     "satellite": Shot(SatelliteScenario, 5.0, (1.5, -8.0, 2.5), "hand", SPACE),
     "forest": Shot(ForestScenario, 5.0, (-8.0, -5.0, 3.0), "base"),
     "plain": Shot(PlainScenario, 5.0, (-8.0, -5.0, 3.0), "base", MARS),
+    "quadruped": Shot(QuadrupedScenario, 1.16, (0.95, -0.95, 0.3), "trunk", values=PUSHED),
     "station": Shot(ArmStation, 1.0, (1.9, 1.3, 0.6), "iiwa_link_6"),
     "double_pendulum": Shot(DoublePendulumScenario, 0.0, (0.5, -1.2, 0.1), "lower", values=SWUNG),
     "cart_pole": Shot(CartPoleScenario, 1.0, (0.5, -2.2, 0.1), "cart"),

@@ -22,6 +22,7 @@ from vtbdrake.visualization.viewpoint import Viewpoint
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator.motions import Motion as ArmMotion
 from vtbdrake_diagrams.manipulator.studies.trials import DURATIONS, PROGRAM, trial_scenario
+from vtbdrake_diagrams.quadruped import QuadrupedScenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.studies.captures import GRIP, bar_in_gripper
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
@@ -104,7 +105,7 @@ def simulated(
     end: float,
     quality: Callable[..., float],
     of: tuple[str, ...],
-    commands: Mapping[float, Mapping[str, float]] | None = None,
+    commands: Mapping[float, Mapping[str, float | tuple[float, ...]]] | None = None,
 ) -> Motion:
     """Simulate a testbed; return its motion with a quality of variables.
 
@@ -141,7 +142,7 @@ def swing_up(label: str, scenario: Scenario) -> Motion:
 def trial(label: str, scenario: Scenario) -> Motion:
     """Return the motion of an arm that swings, draws a circle and presses against a wall."""
     begins = (0.0, 2.0, 5.0)  # s; each motion ends before the next one but one begins
-    commands: dict[float, dict[str, float]] = {
+    commands: dict[float, dict[str, float | tuple[float, ...]]] = {
         begin: {"u.motion": float(motion)} for begin, motion in zip(begins, PROGRAM, strict=True)
     }
     commands[0.0] |= DURATIONS
@@ -170,6 +171,12 @@ def capture(label: str, scenario: Scenario) -> Motion:
     return simulated(scenario, 14.0, lambda *grip: float(np.linalg.norm(bar_in_gripper(*grip))), GRIP)
 
 
+def pushed_trot(label: str, scenario: Scenario) -> Motion:
+    """Return the motion of a quadruped that is pushed from its right at 1 s."""
+    commands: dict[float, dict[str, float | tuple[float, ...]]] = {0.0: {"sim.env.push.impulse": (0.0, 24.0, 0.0)}}
+    return simulated(scenario, 4.0, float, ("sim.sys.quadruped.trunk.height",), commands)
+
+
 CLIMBER = SpaceClimberScenario(gravity=1.62)
 RECORDINGS = {
     "cart_pole": Recording(
@@ -193,6 +200,14 @@ RECORDINGS = {
         Viewpoint((3.6, -1.9, 1.3), (0.8, 0.8, 0.1)),
         spacing=(0.0, 1.2, 0.0),
         sky=SPACE,
+    ),
+    "quadruped": Recording(
+        "A quadruped is pushed from the side at 1 s: trotting on, and deciding on its steps 50 times a second. "
+        "Curves: height of the trunk [m]",
+        {"trot": QuadrupedScenario(), "reasoner on board": QuadrupedScenario(onboard=True)},
+        pushed_trot,
+        Viewpoint((2.6, -1.6, 1.0), (0.0, 0.8, 0.2)),
+        spacing=(1.5, 0.0, 0.0),
     ),
     "satellite": Recording(
         "A servicer sees a tumbling target by camera and laser scanner, and captures it. "

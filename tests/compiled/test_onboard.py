@@ -81,6 +81,17 @@ def test_decides_on_request_as_in_drake() -> None:
     assert {r.computed for candidate in decisions[1].candidates for r in candidate.rollouts} == {"compiled"}
 
 
+@pytest.mark.parametrize(("executor", "computed"), [("auto", "drake"), ("compiled", "compiled")])
+def test_in_a_simulation_it_decides_by_compiled_rollouts_if_asked(executor: str, computed: str) -> None:
+    testbed, context = requested(PusherScenario(executor=executor))
+    planner = testbed.dps.GetSubsystemByName("planner")
+    planner.remember(1)
+    testbed.simulator(context).AdvanceTo(SAMPLED + 0.3)
+    _, decision = planner.decision_shown(planner.GetMyContextFromRoot(context))
+    assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {computed}
+    assert decision.values[CANDIDATE] == pytest.approx(testbed.read(context, f"{PLANNER}.decision"))
+
+
 class Configured(OnboardReasoner):
     def __init__(self, *, scenario: PusherScenario) -> None:
         super().__init__(

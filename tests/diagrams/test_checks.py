@@ -20,6 +20,7 @@ from vtbdrake_diagrams.forest.studies.next_route import RouteScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.plain.scenario import PlainScenario
+from vtbdrake_diagrams.quadruped import QuadrupedScenario
 from vtbdrake_diagrams.recorded_arms.pendulum import TorqueLimitedPendulumScenario
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
@@ -44,6 +45,7 @@ SCENARIOS = {
     ForestScenario: {},
     RouteScenario: {},
     PlainScenario: {},
+    QuadrupedScenario: {},
     ArmStation: {"u.target": HOME + 0.1, "u.opening": 0.1},
     DoublePendulumScenario: {"u.torques": [0.5, 0.3]},
     TorqueLimitedPendulumScenario: {"u.torques": 0.5},

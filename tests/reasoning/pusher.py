@@ -77,6 +77,7 @@ class PusherScenario(Scenario):
     waits: bool = False
     horizon: float = 1.0
     method: str = "CEM"
+    executor: str = "auto"
     # The largest position that a rollout may reach.
     wall: float = 1e3
     reasons: bool = True
@@ -107,7 +108,10 @@ class PusherScenario(Scenario):
             on_request=not self.every,
             believed={"state": 2},
             mental=not self.reasons,
-            options={"search": SearchConfig(method=self.method, workers=1), "constraints": walls},
+            options={
+                "search": SearchConfig(method=self.method, executor=self.executor, workers=1),
+                "constraints": walls,
+            },
         )
 
     def make_dps(self) -> Diagram:

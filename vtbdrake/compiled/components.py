@@ -211,7 +211,7 @@ def _rounded(x: Expression) -> Expression:
 
 
 class JointSensorEquations(SensorEquations):
-    """`JointEncoders` and `JointTachometers`."""
+    """Sensors of entries of the state: `JointEncoders`, `JointTachometers`, `BasePoseSensor`, `BaseTwistSensor`."""
 
     def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
         entries = system.entries.tolist()

@@ -28,6 +28,8 @@ from vtbdrake.compiled.plant import PlantEquations
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.sensors import (
+    BasePoseSensor,
+    BaseTwistSensor,
     ContactSensor,
     ForceTorqueSensor,
     Imu,
@@ -40,6 +42,8 @@ from vtbdrake.state.systems import is_python
 from vtbdrake.testbed.switch import SwitchBoard
 
 EQUATIONS: dict[type, type[Equations]] = {
+    BasePoseSensor: JointSensorEquations,
+    BaseTwistSensor: JointSensorEquations,
     CasadiSystem: CasadiEquations,
     ConstantValueSource: ConstantValueEquations,
     ContactSensor: ContactEquations,

@@ -76,8 +76,9 @@ class OnboardReasoner(SlowPart):
     DPS depends on them, mental rollouts predict it wrongly.
 
     In a simulation a decision takes exactly the latency, and the budget counts rollouts, so that the decision can be
-    repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop they run in
-    processes of their own, and the decision is the best candidate found within 0.8 (latency - period of the loop).
+    repeated exactly; the rollouts run one after another in the thread of the simulation: in Drake, or in the compiled
+    testbed if the executor is ``compiled``. Beside a loop they run in processes of their own, and the decision is the
+    best candidate found within 0.8 (latency - period of the loop).
 
     Args:
         size: Number of entries of the decision.
@@ -97,7 +98,8 @@ class OnboardReasoner(SlowPart):
             part is the value of the port at t_k, for the rules that lead from estimates to the simulated world
             (`VirtualTestbedBuilder.believe`).
         mental: Whether this is the part of a mental copy.
-        options: Further arguments of `Reasoner`. The executor of its `SearchConfig` applies beside a loop only.
+        options: Further arguments of `Reasoner`. An executor of its `SearchConfig` other than ``compiled`` applies
+            beside a loop only.
 
     Raises:
         ValueError: The budget does not count rollouts, another element than ``candidate`` is decided, the horizon ends
@@ -285,8 +287,9 @@ class _Decider:
         """
         with self._taking_turns:
             if self._reasoner is None:
-                search = replace(self._arguments["search"], executor="serial", workers=None)
-                self._reasoner = _CandidateReasoner({**self._arguments, "search": search})
+                self._reasoner = _CandidateReasoner(
+                    {**self._arguments, "search": _in_this_thread(self._arguments["search"])}
+                )
             try:
                 decision = self._reasoner.decide(dps, believed, budget=self._budget)
                 reason = "" if decision else decision.message
@@ -365,6 +368,13 @@ class _CandidateReasoner:
         candidate = self._variables[_CANDIDATE]
         candidate.set(self._context, numbers[places[_CANDIDATE]].reshape(candidate.shape))
         return Belief(replace(dps, contents=replace(contents, numbers=numbers)))
+
+
+def _in_this_thread(search: SearchConfig) -> SearchConfig:
+    """Return the search that a simulation makes in its own thread."""
+    if search.executor == "compiled":
+        return replace(search, workers=1)
+    return replace(search, executor="serial", workers=None)
 
 
 def _check_arguments(decision: Sequence[Element], budget: Budget, horizon: float, latency: float) -> None:

@@ -1,0 +1,1 @@
+"""The studies of the quadruped: how hard it may be pushed."""
