@@ -325,18 +325,39 @@ class DriveEquations(Equations):
         yield Fixed(0, slice(-1, None), "a delay is compiled in")
 
     def output(self, port: str, at: At) -> Expression:
-        return at.state(0)
+        system: Any = self.system
+        return self._torque(at, at.state(1)[: system.n]) if system.step > 0.0 else at.state(0)
 
-    def update(self, at: At) -> dict[int, Expression]:
+    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int, Expression]]]]:
+        system: Any = self.system
+        when = Timing(system.period)
+        if system.step > 0.0:
+            yield Timing(system.step), lambda at: self._last(at, self.output("torque", at))
+            yield when, self._motors
+        else:
+            yield when, self._all
+
+    def _torque(self, at: At, motor: Expression) -> Expression:
+        arguments = [at.parameter(0), motor, at.state(0), at.state(2), at.input("state")]
+        return casadi.densify(self.system.friction.expression(arguments))
+
+    def _last(self, at: At, torque: Expression) -> dict[int, Expression]:
+        return {0: torque, 2: casadi.vertcat(at.input("state")[self.system.velocities], 1.0)}
+
+    def _motors(self, at: At) -> dict[int, Expression]:
         system: Any = self.system
         delayed = u = at.input("command")
-        n, memory = u.numel(), at.state(1)
+        n, memory = system.n, at.state(1)
         in_transit = memory[2 * n :]
         if self._delay:
             delayed = in_transit[(self._delay - 1) * n : self._delay * n]
-        y = system.kernel.expression([at.parameter(0), memory[: 2 * n], delayed, at.input("state")])
+        following = system.motors.expression([at.parameter(0), memory[: 2 * n], delayed])
         shifted = casadi.vertcat(u, in_transit[:-n]) if system.max_delay else casadi.SX(0, 1)
-        return {0: y[:n], 1: casadi.vertcat(y[n:], shifted)}
+        return {1: casadi.vertcat(following, shifted)}
+
+    def _all(self, at: At) -> dict[int, Expression]:
+        following = self._motors(at)
+        return {**following, **self._last(at, self._torque(at, following[1][: self.system.n]))}
 
 
 class CandidateEquations(Equations):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
+from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -93,7 +93,8 @@ def test_drive_starts_with_the_torque_it_had() -> None:
 
 def test_friction_opposes_the_motion() -> None:
     v = np.array([0.3, -0.004])
-    y = torques(2, v=tuple(v), viscous=[2.0, 3.0], coulomb=[1.0, 0.5], coulomb_velocity=0.01)
+    law = {"viscous": [2.0, 3.0], "coulomb": [1.0, 0.5], "coulomb_velocity": 0.01}
+    y = torques(2, v=tuple(v), initial=[8.0, -4.0], **law)
     expected = np.array([8.0, -4.0]) - [2.0 * v[0], 3.0 * v[1]] - np.array([1.0, 0.5]) * np.tanh(v / 0.01)
     np.testing.assert_allclose(y, [expected] * 2, atol=1e-12)
 
@@ -101,7 +102,7 @@ def test_friction_opposes_the_motion() -> None:
 def test_friction_depends_on_speed_load_and_direction() -> None:
     v = np.array([0.3, -0.2])
     law = {"coulomb": 1.0, "coulomb_velocity": 1e-6, "stribeck": [0.5, 0.4], "stribeck_velocity": 0.25}
-    y = torques(2, v=tuple(v), load_friction=0.1, asymmetry=[0.2, -0.3], **law)
+    y = torques(2, v=tuple(v), initial=[8.0, -4.0], load_friction=0.1, asymmetry=[0.2, -0.3], **law)
     size = 1.0 + np.array([0.5, 0.4]) * np.exp(-((v / 0.25) ** 2)) + 0.1 * np.array([8.0, 4.0])
     np.testing.assert_allclose(y, [np.array([8.0, -4.0]) - size * [1.0, -1.0] - [0.2, -0.3]] * 2, atol=1e-12)
 
@@ -121,6 +122,8 @@ def test_every_value_is_a_variable() -> None:
         "motor_torque",
         "reference",
         "in_transit",
+        "last_velocity",
+        "has_last",
         "limit",
         "rate",
         "viscous",
@@ -130,6 +133,7 @@ def test_every_value_is_a_variable() -> None:
         "stribeck_velocity",
         "load_friction",
         "asymmetry",
+        "inertia",
         "time_constant",
         "delay",
     ]
@@ -172,3 +176,41 @@ def test_resumed_drives_stand_where_an_old_command_led_them() -> None:
     for end in (0.0, 0.0005, 0.0105):
         simulator.AdvanceTo(end)
         np.testing.assert_allclose(drives.get_output_port().Eval(context), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("time_step", [0.0, PERIOD, 0.25 * PERIOD])
+@pytest.mark.parametrize("inertia", [2e-5, 2e-3])
+def test_light_joint_sticks_and_slides(time_step: float, inertia: float) -> None:
+    """T Fc / (I v_c) is up to 5,000: friction at the velocity of the step before would turn it around in each step."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, use_sampled_output_ports=False), builder)
+    rotor = SpatialInertia.MakeFromCentralInertia(0.01, [0, 0, 0], RotationalInertia(inertia, inertia, inertia))
+    body = plant.AddRigidBody("rotor", rotor)
+    joint = plant.AddJoint(RevoluteJoint("a", plant.world_frame(), body.body_frame(), [0, 0, 1], damping=0))
+    plant.AddJointActuator("a", joint)
+    plant.Finalize()
+    drives = builder.AddSystem(JointDrives(plant, [joint], period=PERIOD, coulomb=1.0, coulomb_velocity=0.01))
+    builder.Connect(plant.get_state_output_port(), drives.GetInputPort("state"))
+    builder.Connect(drives.get_output_port(), plant.get_actuation_input_port())
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    of_drives, of_plant = drives.GetMyMutableContextFromRoot(context), plant.GetMyMutableContextFromRoot(context)
+    # Below the friction it creeps at artanh(0.9) coulomb_velocity, and stays there.
+    drives.GetInputPort("command").FixValue(of_drives, 0.9)
+    simulator.AdvanceTo(0.2)
+    for _ in range(20):
+        simulator.AdvanceTo(context.get_time() + PERIOD)
+        assert joint.get_angular_rate(of_plant) == pytest.approx(0.01 * np.arctanh(0.9), rel=1e-3)
+    # Beyond it, the rest accelerates.
+    drives.GetInputPort("command").FixValue(of_drives, 1.1)
+    simulator.AdvanceTo(0.3)
+    before = joint.get_angular_rate(of_plant)
+    simulator.AdvanceTo(0.4)
+    assert joint.get_angular_rate(of_plant) - before == pytest.approx(0.1 * 0.1 / inertia, rel=1e-6)
+    # Back below it, it comes to rest without ever turning around.
+    drives.GetInputPort("command").FixValue(of_drives, 0.0)
+    rates = []
+    for _ in range(round(before * inertia / PERIOD) + 200):
+        simulator.AdvanceTo(context.get_time() + PERIOD)
+        rates.append(joint.get_angular_rate(of_plant))
+    assert min(rates) > -1e-3 and abs(rates[-1]) < 1e-6

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf
+from math import inf, pi
 from typing import TYPE_CHECKING
 
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import Context, DiscreteValues
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel, clamp
 from vtbdrake.state import AddressedSystem, Quantity
@@ -18,7 +18,12 @@ if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import Joint
 
-_TINY = float(np.finfo(float).tiny)
+# Friction below this velocity is linear, whatever coulomb_velocity is, in rad/s or m/s.
+_LEAST_EDGE = 1e-9
+# Iterations of Newton's method for a velocity: it approaches from one side, and is exact to rounding before.
+_ITERATIONS = 6
+# Configurations in which the least inertia is looked for.
+_CONFIGURATIONS = 16
 
 
 class JointDrives(AddressedSystem):
@@ -38,9 +43,14 @@ class JointDrives(AddressedSystem):
 
         r_k = clip(u_{k-delay}, +- limit), no further than rate T from r_{k-1}          (amplifier)
         m_k = m_{k-1} + (1 - exp(-T / time_constant)) (r_k - m_{k-1})                   (current loop)
-        torque = m_k - friction(v, m_k)                                                 (friction in gear and bearings)
-        friction = viscous v + asymmetry + tanh(v / coulomb_velocity)
-                   (coulomb + stribeck exp(-(v / stribeck_velocity)^2) + load_friction |m_k|)
+        torque_k = m_k - friction(w)                                                    (friction in gear and bearings)
+        friction = viscous w + asymmetry + tanh(w / coulomb_velocity)
+                   (coulomb + stribeck exp(-(v_k / stribeck_velocity)^2) + load_friction |m_k|)
+        w = 2 v_k - v_{k-1} + T / inertia (torque_k - torque_{k-1})
+
+    The friction is implicit: w is the velocity at the end of the period, extrapolated, with what a change of the torque
+    does to a joint of this ``inertia`` (by default the least one that its drive feels). So a joint sticks, whatever T
+    is, where friction at v_k would turn the velocity around in each period.
 
     The current loop is first-order, the exact solution for a reference that is held; with a time constant of 0 it is
     ideal. A gear without backlash multiplies torque and divides speed: everything here is on its output side.
@@ -49,11 +59,11 @@ class JointDrives(AddressedSystem):
 
     Friction is larger near rest by ``stribeck``, grows with the motor's torque by ``load_friction``, and is larger by
     ``asymmetry`` in positive direction, and smaller in negative one; these are 0 by default. It is smooth: a joint at
-    rest under a load below ``coulomb`` creeps instead of sticking, and with a step T that is not small against
-    M coulomb_velocity / coulomb it chatters.
+    rest under a load below ``coulomb`` creeps, slower than ``coulomb_velocity``.
 
-    The output is the system's state. A command that is itself a state of period T is thus read one period after it was
-    set, and felt by a discrete plant of that period from then on.
+    A continuous plant feels torque_k for a period. A discrete plant feels its friction from its own step on, with that
+    step as T, and the motor's torque m_{k-1} as state: a command that is itself a state of period T is read one period
+    after it was set, and felt by a discrete plant of that period from then on.
 
     All values are parameters of the Context, by address; ``delay`` counts whole periods, up to ``max_delay``.
     """
@@ -119,26 +129,44 @@ class JointDrives(AddressedSystem):
         self.max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
         self.period: float = float(period)  # sample period T in seconds
-        self._n = n
+        self.n = n  # number of joints
         self.entry_names = tuple(joint.name() for joint in joints)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
         self._torque = self.declare_discrete_state(torque=Quantity(before, "N m"))
-        self.DeclareStateOutputPort("torque", self._torque.index)
         # One group for all internal state: every group costs more than the arithmetic.
         memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
         if self.max_delay:
             memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
         self._memory = self.declare_discrete_state(**memory)
+        # The velocities one period before, and 1 if there are some.
+        self._last = self.declare_discrete_state(
+            last_velocity=Quantity(np.zeros(n), "rad/s"), has_last=Quantity(0.0, "1")
+        )
         self._settings = self.declare_parameters(
             **{name: Quantity(value, _UNITS[name], (_lowest(name), inf)) for name, value in entries.items()},
+            inertia=Quantity(least_inertia(plant, joints), "kg m^2", (0.0, inf)),
             time_constant=Quantity(time_constant, "s", (0.0, inf)),
             delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
         velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
-        self.kernel = _kernel(velocities, plant.num_multibody_states(), period=self.period)
-        self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
+        self.velocities = velocities  # their places in the plant's [q; v]
+        self.step: float = float(plant.time_step())  # step in s of a discrete plant, 0 of a continuous one
+        self.motors = _motors(n, self.period)
+        self.friction = _friction(velocities, plant.num_multibody_states(), self.step or self.period, self.step > 0.0)
+        if self.step > 0.0:
+            inputs = {
+                self.all_parameters_ticket(),
+                self._state_port.ticket(),
+                *(self.discrete_state_ticket(group.index) for group in (self._torque, self._memory, self._last)),
+            }
+            self.DeclareVectorOutputPort("torque", n, self._calc_torque, inputs)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.step, 0.0, self._remember)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
+        else:
+            self.DeclareStateOutputPort("torque", self._torque.index)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update_all)
 
     def resume(self, context: Context, command: ArrayLike) -> None:
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time.
@@ -150,9 +178,27 @@ class JointDrives(AddressedSystem):
         torque = np.asarray(command, dtype=float)
         context.SetDiscreteState(self._torque.index, torque)
         context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self.max_delay))
+        context.SetDiscreteState(self._last.index, np.zeros(self.n + 1))
+
+    def _calc_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._torque_with(context, self._memory.array(context)[: self.n]))
+
+    def _torque_with(self, context: Context, motor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the torques that the joints feel with the torques ``motor`` of their motors, each (n,)."""
+        settings, before, last = (group.array(context) for group in (self._settings, self._torque, self._last))
+        return self.friction.value((settings, motor, before, last, self._state_port.Eval(context)))
+
+    def _remember(self, context: Context, state: DiscreteValues) -> None:
+        self._set_last(context, state, self.get_output_port().Eval(context))
+
+    def _set_last(self, context: Context, state: DiscreteValues, torque: NDArray[np.float64]) -> None:
+        self._torque.mutable_array(state)[:] = torque
+        last = self._last.mutable_array(state)
+        last[:-1] = self._state_port.Eval(context)[self.velocities]
+        last[-1] = 1.0
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        n = self._n
+        n = self.n
         settings, memory = self._settings.array(context), self._memory.mutable_array(state)
         delayed = u = self._command.Eval(context)
         if self.max_delay:
@@ -161,10 +207,12 @@ class JointDrives(AddressedSystem):
                 delayed = in_transit[delay - 1].copy()
             in_transit[1:] = in_transit[:-1]
             in_transit[0] = u
-        # The torques, then what the motors and their references have become.
-        y = self.kernel.value((settings, memory[: 2 * n], delayed, self._state_port.Eval(context)))
-        self._torque.mutable_array(state)[:] = y[:n]
-        memory[: 2 * n] = y[n:]
+        memory[: 2 * n] = self.motors.value((settings, memory[: 2 * n], delayed))
+
+    def _update_all(self, context: Context, state: DiscreteValues) -> None:
+        self._update(context, state)
+        motor = self._memory.mutable_array(state)[: self.n]
+        self._set_last(context, state, self._torque_with(context, motor))
 
 
 # Numbers that each joint has, in the order of the parameters.
@@ -187,6 +235,38 @@ def _lowest(name: str) -> float:
     return -inf if name == "asymmetry" else 0.0
 
 
+def least_inertia(plant: MultibodyPlant, joints: Sequence[Joint]) -> NDArray[np.float64]:
+    """Return the least inertia that each drive feels, in kg m^2 or kg, (n,), in the default state and in random ones.
+
+    It is 1 over the sum of the accelerations, without their signs, by which a joint answers torques of 1 N m of all
+    drives: with it, no change of the torques turns any combination of velocities around.
+
+    Args:
+        plant: The plant, finalized.
+        joints: The joints, n of them.
+    """
+    context, random = plant.CreateDefaultContext(), np.random.default_rng(0)
+    q = plant.GetPositions(context)
+    starts = [joint.position_start() for joint in joints]
+    ends = [(joint.position_lower_limits()[0], joint.position_upper_limits()[0]) for joint in joints]
+    lower, upper = np.clip(np.outer([-pi, pi], np.ones(len(joints))) + q[starts], *np.array(ends).reshape(-1, 2).T)
+    places = [joint.velocity_start() for joint in joints]
+    least = np.full(len(joints), inf)
+    for _ in range(_CONFIGURATIONS):
+        accelerations = np.linalg.inv(plant.CalcMassMatrix(context))[np.ix_(places, places)]
+        least = np.minimum(least, 1.0 / abs(accelerations).sum(axis=1))
+        q[starts] = random.uniform(lower, upper)
+        plant.SetPositions(context, q)
+    return least
+
+
+def friction_size(v: Expression, motor: Expression, law: Mapping[str, Expression]) -> Expression:
+    """Return the size of the friction beside the viscous one, in N m, (n, 1); the arguments are `friction_torque`'s."""
+    # A velocity of 0 makes the friction a step.
+    near_rest = casadi.exp(-((v / casadi.fmax(law["stribeck_velocity"], _LEAST_EDGE)) ** 2))
+    return law["coulomb"] + law["stribeck"] * near_rest + law["load_friction"] * casadi.fabs(motor)
+
+
 def friction_torque(v: Expression, motor: Expression, law: Mapping[str, Expression]) -> Expression:
     """Return the torques by which friction resists, in N m, (n, 1).
 
@@ -195,33 +275,66 @@ def friction_torque(v: Expression, motor: Expression, law: Mapping[str, Expressi
         motor: Torques of their motors in N m, (n, 1).
         law: The numbers of `FRICTION`, by name, (n, 1) each.
     """
-    # A velocity of 0 makes the friction a step.
-    near_rest = casadi.exp(-((v / casadi.fmax(law["stribeck_velocity"], _TINY)) ** 2))
-    size = law["coulomb"] + law["stribeck"] * near_rest + law["load_friction"] * casadi.fabs(motor)
-    direction = casadi.tanh(v / casadi.fmax(law["coulomb_velocity"], _TINY))
-    return law["viscous"] * v + size * direction + law["asymmetry"]
+    direction = casadi.tanh(v / casadi.fmax(law["coulomb_velocity"], _LEAST_EDGE))
+    return law["viscous"] * v + friction_size(v, motor, law) * direction + law["asymmetry"]
 
 
-def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
-    """Return [torque; m_k; r_k] as a kernel of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
-
-    ``velocities`` are the places of the joints' velocities in [q; v], which has ``states`` entries.
-    """
-    n = len(velocities)
-    count = len(_UNITS)
-    values, memory = casadi.SX.sym("values", count * n + 2), casadi.SX.sym("memory", 2 * n)
-    u, x = casadi.SX.sym("u", n), casadi.SX.sym("x", states)
-    by_joint = dict(zip(_UNITS, casadi.vertsplit(values[: count * n], n), strict=True))
-    limit, rate = by_joint["limit"], by_joint["rate"]
+def _motors(n: int, period: float) -> Kernel:
+    """Return [m_k; r_k] as a kernel of (parameters, [m_{k-1}; r_{k-1}], delayed command)."""
+    values, memory, u = (casadi.SX.sym(name, size) for name, size in _sizes(n, values=None, memory=2 * n, u=n))
+    by_joint = _by_joint(values, n)
+    limit, reach = by_joint["limit"], by_joint["rate"] * period
     motor, last = casadi.vertsplit(memory, n)
-    reach = rate * period
     reference = clamp(clamp(u, -limit, limit), last - reach, last + reach)
     # 1 where the time constant is 0.
-    gain = -casadi.expm1(-period / values[count * n])
-    following = motor + gain * (reference - motor)
-    friction = friction_torque(x[velocities], following, by_joint)
-    y = casadi.vertcat(following - friction, following, reference)
-    return Kernel("drives", [values, memory, u, x], y, compile=False)
+    gain = -casadi.expm1(-period / values[-2])
+    return Kernel(
+        "motors", [values, memory, u], casadi.vertcat(motor + gain * (reference - motor), reference), compile=False
+    )
+
+
+def _friction(velocities: Sequence[int], states: int, period: float, is_discrete: bool) -> Kernel:
+    """Return the torques at the joints as a kernel of (parameters, m_k, torque_{k-1}, [v_{k-1}; has_last], [q; v]).
+
+    Args:
+        velocities: The places of the joints' velocities in [q; v].
+        states: The number of entries of [q; v].
+        period: The time for which the friction is held, in s.
+        is_discrete: The plant is discrete, whose damping acts at the end of a step; that of a continuous one is best
+            represented in the middle of a period.
+    """
+    n = len(velocities)
+    sizes = _sizes(n, values=None, motor=n, before=n, last=n + 1, x=states)
+    values, motor, before, last, x = (casadi.SX.sym(name, size) for name, size in sizes)
+    law = _by_joint(values, n)
+    v, viscous, asymmetry = x[velocities], law["viscous"], law["asymmetry"]
+    edge, size = casadi.fmax(law["coulomb_velocity"], _LEAST_EDGE), friction_size(v, motor, law)
+    g = period / casadi.fmax(law["inertia"], _LEAST_EDGE)
+    # The end velocity without friction, less what does not depend on it: a w + b tanh(w / edge) = rest.
+    share = 1.0 if is_discrete else 0.5
+    free = 2.0 * v - last[:n] + g * (motor - before)
+    rest = free - g * asymmetry - (1.0 - share) * g * viscous * v
+    a, b = 1.0 + share * g * viscous, g * size
+    # From the solution with a straight edge, Newton's method comes nearer from one side: tanh is concave.
+    sign = casadi.sign(rest)
+    w = casadi.if_else(casadi.fabs(rest) <= a * edge + b, rest / (a + b / edge), (rest - sign * b) / a)
+    for _ in range(_ITERATIONS):
+        t = casadi.tanh(w / edge)
+        w -= (a * w + b * t - rest) / (a + b * (1.0 - t**2) / edge)
+    w = casadi.if_else(last[n] > 0.5, w, v)
+    mean = share * w + (1.0 - share) * v
+    torque = motor - (viscous * mean + size * casadi.tanh(w / edge) + asymmetry)
+    return Kernel("friction", [values, motor, before, last, x], torque, compile=False)
+
+
+def _sizes(n: int, **sizes: int | None) -> list[tuple[str, int]]:
+    """Return names and sizes of the arguments of a kernel; None stands for all parameters."""
+    every = (len(_UNITS) + 1) * n + 2
+    return [(name, every if size is None else size) for name, size in sizes.items()]
+
+
+def _by_joint(values: Expression, n: int) -> dict[str, Expression]:
+    return dict(zip([*_UNITS, "inertia"], casadi.vertsplit(values[:-2], n), strict=True))
 
 
 def _check_joints(joints: Sequence[Joint]) -> None:
