@@ -25,7 +25,7 @@ RANGES = [Parameter(MOMENT, 0.02, 0.2), Parameter(VISCOUS, 0.0, 0.5)]
 
 
 def test_intervals_are_those_of_scipy_where_the_model_is_linear() -> None:
-    """A balanced wheel: I a = u - b v, with torque and friction held for a period, as the drives do.
+    """A balanced wheel: I a = u - b v, with torques that are held for a period, as the drives do.
 
     Only positions are noisy, and the whole recording is one segment, so that the filter is a least-squares fit of
     positions whose begin is free.
@@ -39,9 +39,10 @@ def test_intervals_are_those_of_scipy_where_the_model_is_linear() -> None:
     acting = np.concatenate([[0.0], log.act["torque"].values[:-1, 0]])  # read one period after it was given
 
     def positions(times: np.ndarray, moment: float, viscous: float, q: float, v: float) -> np.ndarray:
-        decay = 1.0 - PERIOD * viscous / moment
-        speeds, _ = scipy.signal.lfilter([0.0, PERIOD / moment], [1.0, -decay], acting, zi=[v])
-        steps = PERIOD * speeds + 0.5 * PERIOD**2 * (acting - viscous * speeds) / moment
+        decay = np.exp(-PERIOD * viscous / moment)
+        speeds, _ = scipy.signal.lfilter([0.0, (1.0 - decay) / viscous], [1.0, -decay], acting, zi=[v])
+        reached = acting / viscous
+        steps = PERIOD * reached + (speeds - reached) * (1.0 - decay) * moment / viscous
         return q + np.concatenate([[0.0], np.cumsum(steps[:-1])])
 
     fit, covariance = scipy.optimize.curve_fit(
@@ -165,8 +166,9 @@ def test_likeliest_noise_is_that_of_the_simulation_and_stationary() -> None:
 
 def test_what_a_recording_will_tell_is_known_beforehand() -> None:
     log, names = recorded(TRUTH, 1, seconds=4.0), {"position": "position", "torque": "torque"}
-    told = information(PendulumScenario(), log, PARAMETERS, noise=NOISE, **names)
-    result = calibrated(recorded(TRUTH, 1, seconds=4.0, noise_seed=8), noise=NOISE)
+    noise = Noise(np.array([2e-4]), np.array([3e-3]), 0.05)  # the drives represent friction by one number per period
+    told = information(PendulumScenario(), log, PARAMETERS, noise=noise, **names)
+    result = calibrated(recorded(TRUTH, 1, seconds=4.0, noise_seed=8), noise=noise)
     ratios = np.array([each.deviation for each in result.parameters.values()]) / told.together
     # One of four segments is kept back, and the sandwich has few blocks.
     assert np.all((ratios > 0.9) & (ratios < 2.5)), (ratios, told)

@@ -56,13 +56,12 @@ def test_steps_are_those_of_drake(time_step: float) -> None:
     z = np.array([1.7, coulomb, viscous])
     motor, _ = model.motor(log.sense["position"].times, u, z)
     x, positions, substeps = np.array([q[0], 0.0]), [q[0]], 1 if time_step else 4
-    v_before = 0.0
     for m in motor[:-1]:
         for _ in range(substeps):
-            x, v_before = model.step(x, v_before, m, PERIOD / substeps, z).full().ravel(), x[1]
+            x = model.step(x, m, PERIOD / substeps, z).full().ravel()
         positions.append(x[0])
-    # A continuous plant is integrated by Drake to its accuracy of 1e-3.
-    np.testing.assert_allclose(positions, q, rtol=0.0, atol=1e-12 if time_step else 1e-5)
+    # A continuous plant is integrated by Drake to its accuracy of 1e-3; the drives predict the end of a step.
+    np.testing.assert_allclose(positions, q, rtol=0.0, atol=3e-4 if time_step else 1e-5)
 
 
 def test_motor_is_that_of_the_drives_and_its_derivatives_those_of_differences() -> None:

@@ -35,7 +35,7 @@ class InterruptAt(logging.Handler):
 
 
 @pytest.mark.one_python
-def test_model_repeats_the_log_of_a_machine_to_rounding() -> None:
+def test_model_repeats_the_log_of_a_machine_but_for_predicted_friction() -> None:
     truth = {DELAY: 3.0, FRICTION: 0.7, PAYLOAD: 1.3}
     log = machine_log(SCENARIO, 0.25, machine=MachineConfig(values=truth), values=PLANNED)
     model = JointModel(SCENARIO.build(), [Parameter(address, 0.0, 5.0) for address in truth])
@@ -46,8 +46,8 @@ def test_model_repeats_the_log_of_a_machine_to_rounding() -> None:
     x = np.hstack([q, v])
     # What the drives held before the log is forgotten by then.
     for k in range(40, len(q) - 1):
-        following = model.step(x[k], v[k - 1], motor[k], 0.001, z).full().ravel()
-        np.testing.assert_allclose(following, x[k + 1], rtol=0.0, atol=1e-12)
+        following = model.step(x[k], motor[k], 0.001, z).full().ravel()
+        np.testing.assert_allclose(following, x[k + 1], rtol=0.0, atol=5e-4)
 
 
 @pytest.mark.slow

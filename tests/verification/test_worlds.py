@@ -223,7 +223,7 @@ def test_oscillator_with_coulomb_friction(verify: Verify) -> None:
 
         m x'' + k x = -F sign x',   m = 1 kg, k = 100 N/m, F = 2 N
 
-    The drive's friction is F tanh(x' / (1 mm/s)), felt a step later.
+    The drive's friction is F tanh(x' / (1 mm/s)), implicit in each step.
     Reference: 0.5 m less 0.08 m per cycle, at the turning points. Tolerance: the second order in the step of 0.2 ms,
     k x h^2 / m = 2e-6 m, for three cycles.
     """
@@ -238,14 +238,29 @@ def test_geared_wheel_spins_down(verify: Verify) -> None:
 
         (m r^2 / 2 + N^2 I_rotor) w' = -F
 
-    Reference: w = 2 rad/s - F (t - T) / I, as the drive feels the first velocity one period T late. Tolerance:
-    rounding.
+    Reference: w = 2 rad/s - F t / I. Tolerance: rounding.
     """
     scenario = GearedWheel()
     run = Run(scenario, {"axle.velocity": 2.0}).to(0.5)
     inertia = 2.0 * 0.5**2 / 2 + scenario.gear**2 * scenario.rotor
-    expected = 2.0 - 0.9 / inertia * (0.5 - scenario.plant_config.time_step)
+    expected = 2.0 - 0.9 / inertia * 0.5
     verify("rate", run["axle.velocity"], expected, tolerance=1e-12, unit="rad/s")
+
+
+@pytest.mark.parametrize("step", [1e-3, 2e-4], ids=["1 ms", "0.2 ms"])
+def test_light_drive_comes_to_rest(verify: Verify, step: float) -> None:
+    """Light drive that comes to rest: with I = 0.25 g m^2, T F / (I v_c) is 400 at T = 1 ms, and it does not chatter.
+
+        I w' = -F sign w,   F = 1 N m in the drive, as F tanh(w / (10 mrad/s))
+
+    Reference: from 1,000 rad/s it comes to rest after t = I w / F = 0.25 s and the angle w t / 2, and stays there.
+    Tolerance: half a step of semi-implicit Euler at the first rate, T w / 2, and a thousandth for the edge; of the
+    rate at 0.3 s, rounding.
+    """
+    scenario = GearedWheel(plant_config=discrete(step), coulomb=1.0, gear=1.0, rotor=0.0, wheel=0.002)
+    run = Run(scenario, {"axle.velocity": 1000.0}).to(0.3)
+    verify("angle", run["axle.position"], 125.0, tolerance=1.001 * step * 1000.0 / 2.0, unit="rad")
+    verify("rate", run["axle.velocity"], 0.0, tolerance=1e-9, unit="rad/s")
 
 
 @pytest.mark.slow_cases

@@ -443,17 +443,19 @@ class Oscillator(World):
 
 @dataclass
 class GearedWheel(World):
-    """A wheel of 2 kg and 0.5 m behind a gear of 100, whose rotor has 2e-5 kg m^2, with Coulomb friction of 0.9 N m."""
+    """A wheel of 0.5 m behind a gear, with Coulomb friction in its drive."""
 
     plant_config: MultibodyPlantConfig = field(default_factory=lambda: discrete(1e-3))
     coulomb: float = 0.9
     gear: float = 100.0
     rotor: float = 2e-5
+    wheel: float = 2.0
 
     forces: ClassVar[int] = 1
 
     def add_bodies(self, plant: MultibodyPlant, instance: ModelInstanceIndex) -> None:
-        wheel = plant.AddRigidBody("wheel", instance, SpatialInertia.SolidCylinderWithMass(2.0, 0.5, 0.1, [0, 0, 1]))
+        inertia = SpatialInertia.SolidCylinderWithMass(self.wheel, 0.5, 0.1, [0, 0, 1])
+        wheel = plant.AddRigidBody("wheel", instance, inertia)
         add_hinge(plant, "axle", plant.world_body(), RigidTransform(), wheel, [0, 0, 1])
         motor = plant.AddJointActuator("motor", plant.GetJointByName("axle"))
         motor.set_default_gear_ratio(self.gear)

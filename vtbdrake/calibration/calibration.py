@@ -17,7 +17,7 @@ from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques
-from vtbdrake.calibration.missing_terms import chattering, missing_terms
+from vtbdrake.calibration.missing_terms import lost_friction, missing_terms
 from vtbdrake.calibration.posterior import sandwich_covariance
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 COLOURED = 0.2
 # A hold-out whose innovations are larger by this factor is called worse; a test of significance rejects any real model.
 WORSE = 1.3
+# The quantile of the innovations that is compared, too: where a joint breaks loose, single ones may be many deviations
+# with the right model.
+_LARGE = 0.95
 # Largest number of iterations.
 _ITERATIONS = 25
 # The last iteration moves the parameters by less than this share of their standard deviations.
@@ -440,9 +443,10 @@ def _result(
     reasons = [*prepared.doubts, *bounds.reasons]
     if correlation > COLOURED:
         reasons.append(f"the innovations are coloured (autocorrelation {correlation:.2g}): the model lacks something")
-    if holdout > WORSE * fit:
+    if _is_worse(white, used):
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
-    reasons += chattering(segments, prepared.start, z)
+    deviations = np.sqrt(np.diag(sandwich)) * model.scales
+    reasons += lost_friction(segments, prepared.start, z, noise, deviations)
     reasons += map(str, missing_terms(segments, linearized, noise, z, used, info))
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
@@ -509,6 +513,17 @@ def calibrated_scenario(
         pedigree.numbers[address] = number
     pedigree.posterior, pedigree.logs, pedigree.reasons = posterior, dict(logs), list(reasons)
     return calibrated
+
+
+def _is_worse(white: Array, used: NDArray[np.bool]) -> bool:
+    """Return whether innovations (N, W, nq) are worse where they were not fitted, in the mean and but for outliers."""
+    if used.all():
+        return False
+    parts = white[:, ~used], white[:, used]
+    means, large = (
+        [measure(part) for part in parts] for measure in (_rms, lambda part: np.quantile(abs(part), _LARGE))
+    )
+    return bool(means[0] > WORSE * means[1] and large[0] > WORSE * large[1])
 
 
 def _rms(white: Array) -> float:

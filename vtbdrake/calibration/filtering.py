@@ -47,6 +47,10 @@ _FARTHEST = 2.0
 # Commands with less jitter than this share of their period come by a clock.
 _REGULAR = 0.2
 _LEAST = 1e-9  # of a deviation, in rad or m
+# Steps of Runge and Kutta resolve friction near rest up to this product of step and sharpness; 2.8 is unstable.
+_RESOLVED = 1.0
+# Largest number of such steps within a period.
+_MOST_SUBSTEPS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,48 +344,77 @@ class Segments:
         smoothed = [np.hstack(recording.smoothed()[:2]) for recording in recordings]
         self.trajectory = np.stack([smoothed[i][span] for i, span in self._pieces], axis=1)
         self._q = np.stack([recordings[i].q[span] for i, span in self._pieces], axis=1)
-        steps = np.stack([np.diff(recordings[i].times[span]) for i, span in self._pieces], axis=1)
-        self._h = steps / self._substeps if model.step_size <= 0.0 else np.full_like(steps, model.step_size)
+        self._steps = np.stack([np.diff(recordings[i].times[span]) for i, span in self._pieces], axis=1)
         self._function = self._compile().map(self.steps * self.count)
 
     def _compile(self) -> casadi.Function:
-        """Return the function (x, change, m, h, z) -> following x, and its Jacobians by x, m and z, side by side.
-
-        The change is the velocities' change in the step before; only the friction of a discrete plant feels it.
-        """
-        x, change, m, h, z = self.model.step.sx_in()
-        following, v_before = x, x[self.model.nq :] - change
-        for _ in range(self._substeps):
-            following, v_before = self.model.step(following, v_before, m, h, z), following[self.model.nq :]
+        """Return the function (x, m, h, z) -> following x, and its Jacobians by x, m and z, side by side."""
+        x, m, h, z = self.model.step.sx_in()
+        following = self.model.step(x, m, h, z)
         parts = [following, *(casadi.jacobian(following, by) for by in (x, m, z))]
         table = casadi.densify(casadi.horzcat(*parts))
-        return compiled_if_possible(casadi.Function("calibration_step", [x, change, m, h, z], [table], {"cse": True}))
+        return compiled_if_possible(casadi.Function("calibration_step", [x, m, h, z], [table], {"cse": True}))
+
+    def substeps(self, z: Array) -> int:
+        """Return the number of steps within a period: those of a discrete plant, or fine enough for friction near rest.
+
+        Args:
+            z: The parameters, (nz,).
+
+        Raises:
+            CalibrationError: The friction of a joint needs too many.
+        """
+        model = self.model
+        if model.step_size > 0.0 or not model.drives:
+            return self._substeps
+        sharpness = np.asarray(model.sharpness(self.trajectory[..., : model.nq].mean(axis=(0, 1)), z)).ravel()
+        ratios = self.period * sharpness
+        if ratios.max(initial=0.0) > _RESOLVED * _MOST_SUBSTEPS:
+            name, ratio = model.actuated_names[int(ratios.argmax())], ratios.max()
+            raise CalibrationError(
+                f"the friction of {name} is too sharp near rest for a continuous plant: T Fc / (I v_c) is {ratio:.2g}, "
+                f"and at most {_RESOLVED * _MOST_SUBSTEPS:g} is resolved: make coulomb_velocity "
+                f"{ratio / (_RESOLVED * _MOST_SUBSTEPS):.2g} times larger, or take a discrete plant (time_step)"
+            )
+        self._substeps = max(self._substeps, ceil(ratios.max(initial=0.0) / _RESOLVED))
+        return self._substeps
 
     def linearized(self, z: Array) -> Linearization:
         """Return the model along the trajectory."""
-        n, nu = self.model.nq, self.model.nu
         motors = [self.model.motor(recording.times, recording.u, z) for recording in self._recordings]
         m = np.stack([motors[i][0][span][:-1] for i, span in self._pieces], axis=1)
         by = np.stack([motors[i][1][span][:-1] for i, span in self._pieces], axis=1)
-        count = self.steps * self.count
-        v = self.trajectory[:, :, n:]
-        change = np.diff(v, axis=0) / self._substeps
-        change = np.concatenate([change[:1], change[:-1]])  # Before the first step: about its own.
-        # CasADi's columns are rows here.
-        columns = (self.trajectory[:-1], change, m, self._h, np.tile(z, (count, 1)))
-        arguments = [np.ascontiguousarray(argument).reshape(-1) for argument in columns]
+        following, A, by_m, slopes = self._stepped(m, z)
+        for k, index in enumerate(self.model.drive_parameters):
+            slopes[..., index] += np.einsum("twij,twj->twi", by_m, by[:, :, k])
+        return Linearization(A, by_m @ self.model.selection.T, following - self.trajectory[1:], slopes)
+
+    def _stepped(self, m: Array, z: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the states a period later, and their derivatives by state, motors' torques m and parameters."""
+        n, nu = self.model.nq, self.model.nu
+        count, substeps = self.steps * self.count, self.substeps(z)
+        h = np.full_like(self._steps, self.model.step_size) if self.model.step_size > 0.0 else self._steps / substeps
         table = np.empty((count, 1 + 2 * n + nu + len(z), 2 * n))
         buffer: Any  # whose stubs ask for a size that it does not take
         buffer, evaluate = self._function.buffer()
-        for i, argument in enumerate(arguments):
-            buffer.set_arg(i, argument.data)
         buffer.set_res(0, table.reshape(-1).data)
-        evaluate()
-        parts = table.swapaxes(1, 2).reshape(self.steps, self.count, 2 * n, -1)
-        following, A, by_m, slopes = np.split(parts, [1, 1 + 2 * n, 1 + 2 * n + nu], axis=3)
-        for k, index in enumerate(self.model.drive_parameters):
-            slopes[..., index] += np.einsum("twij,twj->twi", by_m, by[:, :, k])
-        return Linearization(A, by_m @ self.model.selection.T, following[..., 0] - self.trajectory[1:], slopes.copy())
+        x, derivatives = self.trajectory[:-1], None
+        for _ in range(substeps):
+            # CasADi's columns are rows here.
+            arguments = [np.ascontiguousarray(each).reshape(-1) for each in (x, m, h, np.tile(z, (count, 1)))]
+            for i, argument in enumerate(arguments):
+                buffer.set_arg(i, argument.data)
+            evaluate()
+            parts = table.swapaxes(1, 2).reshape(self.steps, self.count, 2 * n, -1)
+            x, by_x, others = parts[..., 0].copy(), parts[..., 1 : 1 + 2 * n], parts[..., 1 + 2 * n :]
+            if derivatives is None:
+                derivatives = parts[..., 1:].copy()
+            else:
+                derivatives = by_x @ derivatives
+                derivatives[..., 2 * n :] += others
+        assert derivatives is not None
+        A, by_m, slopes = np.split(derivatives, [2 * n, 2 * n + nu], axis=3)
+        return x, A, by_m, slopes.copy()
 
     def torques(self, z: Array) -> tuple[Array, Array]:
         """Return the motors' torques and the friction of the drives at the joints, (N, W, nq) each, in N m or N."""

@@ -1,14 +1,14 @@
 r"""The joints of a testbed as one function of its parameters: plant and drives, written in CasADi.
 
-The drives are `JointDrives`: they feel a command one period after it was given, hold torque and friction
-during a step, and a discrete plant feels the torque another period later, with the friction at the velocity of the step
-before. Other than theirs, the delay may be any time, not only whole periods.
+The drives are `JointDrives`: they feel a command one period after it was given and hold the motor's torque during a
+step, and a discrete plant feels it another period later. Their friction is implicit in a discrete plant's step, and
+continuous in time with a continuous plant. Other than theirs, the delay may be any time, not only whole periods.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.actuators import JointDrives
-from vtbdrake.components.actuators.joint_drives import FRICTION, friction_torque
+from vtbdrake.components.actuators.joint_drives import FRICTION, end_velocity, friction_size, friction_torque
 from vtbdrake.components.casadi_system.kernel import Expression
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.optimization import Parameter
@@ -37,6 +37,8 @@ _DRIVE = re.compile(rf"(sim\.act\.\w+)\.({_VARIED})(?:\[(\d+)\])?$")
 _PARTS = ("mass", "center_of_mass", "inertia")
 _WHOLE = "whole"
 _TINY = 1e-12
+# How often the friction of each joint is solved for, given the other joints'.
+_SWEEPS = 3
 
 
 class CalibrationError(ValueError):
@@ -118,7 +120,10 @@ class JointModel:
         nq, nu: Numbers of joint positions, and of actuators.
         joint_names: Names of the joints, by position.
         actuated_names: Names of the joints with actuators, by actuator.
-        chatter: (q, z) -> T Fc / (I v_c) of each actuator's friction, (nu,): held over a period, it chatters above 2.
+        actuator_of: The actuator of each joint, by position; -1 without one.
+        friction_parameters: The places in z of numbers of the drives' friction.
+        sharpness: (q, z) -> Fc / (I v_c) of each actuator's friction near rest, (nu,), in 1/s.
+        step: (x, m, h, z) -> x after a step of h seconds.
         edges: The velocity below which the Coulomb friction of a joint fades, (nq,), in rad/s or m/s.
 
     Raises:
@@ -241,38 +246,39 @@ class JointModel:
             plant.get_joint_actuator(index).joint().name() for index in plant.GetJointActuatorIndices()
         )
         self.selection: Array = plant.MakeActuationMatrix()
+        self.actuator_of = [int(row.argmax()) if row.any() else -1 for row in self.selection]
+        matches = [_DRIVE.match(name) for name in self.names]
+        self.friction_parameters = [k for k, match in enumerate(matches) if match and match[2] in FRICTION]
         selection = casadi.SX(casadi.DM(self.selection))
         drive = {name: self._drive_parameter(name, testbed, context, z) for name in FRICTION}
         q, v, m = dynamics.symbols()
         a, h = casadi.SX.sym("a", self.nq), casadi.SX.sym("h")
-        x, v_before = casadi.vertcat(q, v), casadi.SX.sym("v_before", self.nq)
+        x = casadi.vertcat(q, v)
 
         def friction(velocities: Expression) -> Expression:
             return friction_torque(selection.T @ velocities, m, drive)
 
-        def driven(velocities: Expression) -> Expression:
-            return selection @ (m - friction(velocities))
-
-        # The drives of a discrete plant act in the step after that in which they saw the velocities.
-        tau = driven(v_before if self.step_size > 0.0 else v)
-        needed = dynamics.inverse_dynamics(q, v, a) + dynamics.damping_torque(v) - driven(v - self.step_size * a)
+        tau = selection @ (m - friction(v))
+        needed = dynamics.inverse_dynamics(q, v, a) + dynamics.damping_torque(v) - tau
         held_torque = casadi.SX.sym("tau", self.nq)
         results = [needed, tau, casadi.vertcat(v, dynamics.acceleration(q, v, held_torque))]
         if self.step_size > 0.0:
-            results.append(casadi.vertcat(*dynamics.step(q, v, tau, self.step_size)))
+            rest = m - _friction_at_end(dynamics, (q, v, m), selection, drive, self.step_size)
+            results.append(casadi.vertcat(*dynamics.step(q, v, selection @ rest, self.step_size)))
         needed, tau, rate, *step = dynamics.substituted(results, inputs)
         edges = casadi.Function("edges", [z], [drive["coulomb_velocity"]])(self.start)
         self.edges = self.selection @ np.asarray(edges).ravel()
         inertia = casadi.jacobian(dynamics.inverse_dynamics(q, v, a), a)
         (inertia,) = dynamics.substituted([inertia], inputs)
         sharpness = drive["coulomb"] / (selection.T @ casadi.diag(inertia)) / drive["coulomb_velocity"]
-        self.chatter = casadi.Function("chatter", [q, z], [casadi.densify(self._drive_period * sharpness)])
+        self.sharpness = casadi.Function("sharpness", [q, z], [casadi.densify(sharpness)])
         lost = selection @ friction(v) + dynamics.substituted([dynamics.damping_torque(v)], inputs)[0]
         self.friction = casadi.Function("friction", [v, m, z], [casadi.densify(lost)])
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
-        following = step[0] if step else _runge_kutta(lambda state: f(state, tau, z), x, h)
-        self.step = casadi.Function("step", [x, v_before, m, h, z], [following], {"cse": True})
+        driven = casadi.Function("driven", [x, m, z], [tau])
+        following = step[0] if step else _runge_kutta(lambda state: f(state, driven(state, m, z), z), x, h)
+        self.step = casadi.Function("step", [x, m, h, z], [following], {"cse": True})
 
     def motor(self, times: Array, u: Array, z: Array) -> tuple[Array, Array]:
         """Return the motors' torques after delay and current loop, (n, nu), and their derivatives (n, k, nu).
@@ -319,6 +325,40 @@ class JointModel:
             if (match := _DRIVE.match(parameter)) and match[2] == name:
                 value[slice(None) if match[3] is None else int(match[3])] = z[k]
         return value
+
+
+def _friction_at_end(
+    dynamics: PlantDynamics,
+    at: tuple[Expression, Expression, Expression],
+    selection: Expression,
+    law: Mapping[str, Expression],
+    period: float,
+) -> Expression:
+    """Return the friction of the drives with the velocities at the end of a step, in N m, (nu, 1).
+
+    Joint by joint, the velocity solves its own equation with the friction of the others (Gauss and Seidel).
+
+    Args:
+        dynamics: The plant.
+        at: Positions, velocities and motors' torques at the begin of the step.
+        selection: The actuation matrix, (nv, nu).
+        law: The numbers of the friction, see `friction_torque`.
+        period: The step, in s.
+    """
+    q, v, m = at
+    A, momentum = dynamics.momentum_balance(q, v, selection @ m, period)
+    factor = casadi.chol(A)
+    response = casadi.solve(factor, casadi.solve(factor.T, selection))
+    free, response = selection.T @ casadi.solve(factor, casadi.solve(factor.T, momentum)), selection.T @ response
+    size, friction = friction_size(selection.T @ v, m, law), casadi.SX(free.shape[0], 1)
+    for _ in range(_SWEEPS if free.shape[0] > 1 else 1):
+        for i in range(free.shape[0]):
+            g = period * response[i, i]
+            rest = free[i] - period * response[i, :] @ friction + g * (friction[i] - law["asymmetry"][i])
+            edge = law["coulomb_velocity"][i]
+            w = end_velocity(1.0 + g * law["viscous"][i], g * size[i], rest, edge)
+            friction[i] = law["viscous"][i] * w + size[i] * casadi.tanh(w / edge) + law["asymmetry"][i]
+    return friction
 
 
 def _filled(values: Array, parts: Sequence[tuple[str | None, Expression]]) -> Expression:

@@ -30,10 +30,10 @@ _SIMPLER = 1.25
 # The noise was fitted without the term, and is too large if there is one: the deviation is at least this share of the
 # one by the noise.
 _LEAST_DEVIATION = 0.5
-# Held friction is stable up to this: the velocity changes by a factor of 1 - T Fc / (I v_c) in a step.
-_CHATTERS = 2.0
 # A term of whose information the fitted parameters take more than all but this share is not told apart from them.
 _OWN = 0.15
+# Friction that is less than this share of what inverse dynamics see is doubted.
+_LOST = 0.6
 # The quantiles of a joint's speeds at which Stribeck's friction is tried, and how much wider than the edge of Coulomb's
 # friction it is at least: the edge is the model's own simplification.
 _SLOW = (0.1, 0.3)
@@ -70,25 +70,34 @@ class MissingTerm:
         )
 
 
-def chattering(segments: Segments, start: Array, z: Array) -> list[str]:
-    """Return for which joints the model's friction chatters, as sentences: its estimates say nothing.
+def lost_friction(segments: Segments, start: Array, z: Array, noise: Noise, deviations: Array) -> list[str]:
+    """Return for which joints the filter took friction away that inverse dynamics see, as sentences.
 
-    Friction that is held over a period T turns the velocity around if T Fc / (I v_c) is above 2.
+    A disturbance of the torques can take the place of friction. Inverse dynamics have no such disturbance, and are less
+    exact; so only a large departure counts, beside a disturbance that is as large as the friction.
 
     Args:
         segments: The recordings, with their filtered trajectories.
-        start: The parameters by inverse dynamics, which hold nothing: the filter may have taken friction away.
+        start: The parameters by inverse dynamics, (nz,).
         z: The estimate, (nz,).
+        noise: The likeliest noise.
+        deviations: The standard deviations of the estimate, (nz,).
     """
     model = segments.model
-    q = segments.trajectory[..., : model.nq].mean(axis=(0, 1))
-    ratios = np.max([np.asarray(model.chatter(q, at)).ravel() for at in (start, z)], axis=0)
-    return [
-        f"the friction of {name} is held over a period and chatters: T Fc / (I v_c) is {ratio:.2g}, and must not "
-        f"exceed {_CHATTERS:g}: make coulomb_velocity {ratio / _CHATTERS:.2g} times larger, or the period shorter"
-        for name, ratio in zip(model.actuated_names, ratios, strict=True)
-        if ratio > _CHATTERS
-    ]
+    before, after = (segments.torques(at)[1] for at in (start, z))
+    reasons = []
+    for j, name in enumerate(model.joint_names):
+        varied = [k for k in model.friction_parameters if model.names[k].endswith(f"[{model.actuator_of[j]}]")]
+        departed = max((abs(z[k] - start[k]) / max(deviations[k], 1e-300) for k in varied), default=0.0)
+        first, last = _rms(before[..., j]), _rms(after[..., j])
+        disturbance = float(noise.torque[j])
+        if departed > SIGNIFICANT and last < _LOST * first and disturbance > last:
+            reasons.append(
+                f"the friction of {name} is {last:.3g} N m (or N) in the mean, {departed:.2g} deviations from inverse "
+                f"dynamics, which see {first:.3g}, and a disturbance of {disturbance:.3g} takes its place: the law of "
+                "the friction is another one, or the motion hardly slides"
+            )
+    return reasons
 
 
 def missing_terms(

@@ -50,7 +50,8 @@ class JointDrives(AddressedSystem):
 
     The friction is implicit: w is the velocity at the end of the period, extrapolated, with what a change of the torque
     does to a joint of this ``inertia`` (by default the least one that its drive feels). So a joint sticks, whatever T
-    is, where friction at v_k would turn the velocity around in each period.
+    is, where friction at v_k would turn the velocity around in each period. With a continuous plant, viscous friction
+    is the mean of both ends, and what slides through rest within a period has its friction in both directions.
 
     The current loop is first-order, the exact solution for a reference that is held; with a time constant of 0 it is
     ideal. A gear without backlash multiplies torque and divides speed: everything here is on its output side.
@@ -114,18 +115,11 @@ class JointDrives(AddressedSystem):
         super().__init__()
         _check_joints(joints)
         n = len(joints)
-        by_joint = {
-            "limit": limit,
-            "rate": rate,
-            "viscous": viscous,
-            "coulomb": coulomb,
-            "coulomb_velocity": coulomb_velocity,
-            "stribeck": stribeck,
-            "stribeck_velocity": stribeck_velocity,
-            "load_friction": load_friction,
-            "asymmetry": asymmetry,
-        }
-        entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in by_joint.items()}
+        by_joint = (
+            limit, rate, viscous, coulomb, coulomb_velocity, stribeck, stribeck_velocity, load_friction, asymmetry,
+        )  # fmt: skip
+        numbers = zip(_UNITS, by_joint, strict=True)
+        entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in numbers}
         self.max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
         self.period: float = float(period)  # sample period T in seconds
@@ -150,23 +144,25 @@ class JointDrives(AddressedSystem):
             time_constant=Quantity(time_constant, "s", (0.0, inf)),
             delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
-        velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
-        self.velocities = velocities  # their places in the plant's [q; v]
+        self.velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]  # places in [q; v]
         self.step: float = float(plant.time_step())  # step in s of a discrete plant, 0 of a continuous one
         self.motors = _motors(n, self.period)
-        self.friction = _friction(velocities, plant.num_multibody_states(), self.step or self.period, self.step > 0.0)
-        if self.step > 0.0:
-            inputs = {
-                self.all_parameters_ticket(),
-                self._state_port.ticket(),
-                *(self.discrete_state_ticket(group.index) for group in (self._torque, self._memory, self._last)),
-            }
-            self.DeclareVectorOutputPort("torque", n, self._calc_torque, inputs)
-            self.DeclarePeriodicDiscreteUpdateEvent(self.step, 0.0, self._remember)
-            self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
-        else:
+        is_discrete, states = self.step > 0.0, plant.num_multibody_states()
+        self.friction = _friction(self.velocities, states, self.step or self.period, is_discrete)
+        self._declare_torque()
+
+    def _declare_torque(self) -> None:
+        """Declare the output port and the updates: a discrete plant feels friction that is computed at its own step."""
+        if not self.step > 0.0:
             self.DeclareStateOutputPort("torque", self._torque.index)
             self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update_all)
+            return
+        groups = self._torque, self._memory, self._last
+        inputs = {self.discrete_state_ticket(group.index) for group in groups}
+        inputs |= {self.all_parameters_ticket(), self._state_port.ticket()}
+        self.DeclareVectorOutputPort("torque", self.n, self._calc_torque, inputs)
+        self.DeclarePeriodicDiscreteUpdateEvent(self.step, 0.0, self._remember)
+        self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
 
     def resume(self, context: Context, command: ArrayLike) -> None:
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time.
@@ -315,16 +311,30 @@ def _friction(velocities: Sequence[int], states: int, period: float, is_discrete
     free = 2.0 * v - last[:n] + g * (motor - before)
     rest = free - g * asymmetry - (1.0 - share) * g * viscous * v
     a, b = 1.0 + share * g * viscous, g * size
+    passed = casadi.SX.zeros(n)
+    if not is_discrete:
+        # What slides through rest has one friction before, the other one after: from the share of the period on.
+        change, slowing = rest - v, b * casadi.tanh(v / edge)
+        turns = v * (rest - slowing) < 0.0
+        passed = casadi.if_else(turns, v / casadi.if_else(turns, slowing - change, 1.0), 0.0)
+        rest, b = casadi.if_else(turns, (1.0 - passed) * change, rest), (1.0 - passed) * b
+    w = end_velocity(a, b, rest, edge)
+    w = casadi.if_else(last[n] > 0.5, w, v)
+    passed = casadi.if_else(last[n] > 0.5, passed, 0.0)
+    direction = passed * casadi.tanh(v / edge) + (1.0 - passed) * casadi.tanh(w / edge)
+    torque = motor - (viscous * (share * w + (1.0 - share) * v) + size * direction + asymmetry)
+    return Kernel("friction", [values, motor, before, last, x], torque, compile=False)
+
+
+def end_velocity(a: Expression, b: Expression, rest: Expression, edge: Expression) -> Expression:
+    """Return w with a w + b tanh(w / edge) = rest, all (n, 1), for positive a, b and edge."""
     # From the solution with a straight edge, Newton's method comes nearer from one side: tanh is concave.
-    sign = casadi.sign(rest)
-    w = casadi.if_else(casadi.fabs(rest) <= a * edge + b, rest / (a + b / edge), (rest - sign * b) / a)
+    slides = casadi.fabs(rest) > a * edge + b
+    w = casadi.if_else(slides, (rest - casadi.sign(rest) * b) / a, rest / (a + b / edge))
     for _ in range(_ITERATIONS):
         t = casadi.tanh(w / edge)
         w -= (a * w + b * t - rest) / (a + b * (1.0 - t**2) / edge)
-    w = casadi.if_else(last[n] > 0.5, w, v)
-    mean = share * w + (1.0 - share) * v
-    torque = motor - (viscous * mean + size * casadi.tanh(w / edge) + asymmetry)
-    return Kernel("friction", [values, motor, before, last, x], torque, compile=False)
+    return w
 
 
 def _sizes(n: int, **sizes: int | None) -> list[tuple[str, int]]:
