@@ -22,6 +22,7 @@ Law = Callable[[float, float], float]
 LAWS: dict[str, Law] = {
     "Coulomb": lambda v, torque: COULOMB,
     "Stribeck": lambda v, torque: COULOMB * (1.0 + 0.8 * np.exp(-((v / 0.3) ** 2))),
+    "tolerance": lambda v, torque: COULOMB * (1.0 + 0.1 * np.exp(-((v / 0.3) ** 2))),
     "direction": lambda v, torque: COULOMB * (1.3 if v > 0.0 else 0.7),
     "load": lambda v, torque: 0.5 * COULOMB + 0.1 * abs(torque),
 }

@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import DRIVES, PendulumScenario
+from tests.calibration import light_joint
+from tests.calibration.pendulum import DRIVES
 from tests.calibration.plain_pendulum import commanded, recorded
-from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, VALUES, VISCOUS, calibrated
-from vtbdrake.calibration import calibrate
+from tests.calibration.test_calibration import COULOMB, PARAMETERS, VALUES, VISCOUS, calibrated
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.optimization import Parameter
 
@@ -92,8 +92,5 @@ def test_zero_offset_of_an_encoder_is_told(seed: int) -> None:
 @pytest.mark.parametrize("coulomb_velocity", [0.01, 0.05])
 def test_friction_of_a_light_joint_that_sticks_is_right(coulomb_velocity: float) -> None:
     """T Fc / (I v_c) is 0.004 s 1.2 N m / (0.02 kg m^2 0.01 rad/s) = 24: held for a period, friction would chatter."""
-    log = recorded(seed=20, center=0.05, moment=0.0175, coulomb=1.0, amplitude=2.5)
-    parameters = [Parameter(MOMENT, 1e-3, 0.3), Parameter(COULOMB, 0.0, 5.0), Parameter(VISCOUS, 0.0, 0.5)]
-    scenario = PendulumScenario(coulomb_velocity=coulomb_velocity).with_values({FIRST: -0.05})
-    result = calibrate(scenario, log, parameters, position="position", torque="torque")
-    assert result.parameters[COULOMB].value == pytest.approx(1.2, rel=0.05)
+    friction = light_joint.calibrated(coulomb_velocity, time_step=0.0).parameters[COULOMB]
+    assert friction.value == pytest.approx(light_joint.FRICTION, rel=0.05)

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import COULOMB, MASS, PendulumScenario, recorded
+from tests.calibration.pendulum import COULOMB, DRIVES, MASS, PendulumScenario, recorded
 from tests.cli.program import error_of, run
 from vtbdrake import Parameter, load_scenario
 from vtbdrake.calibration import calibrate
 from vtbdrake_diagrams.manipulator.arm import Arm
 
+VISCOUS = f"{DRIVES}.viscous[0]"
 SCENARIO = "tests.calibration.pendulum:PendulumScenario"
 SIGNALS = ("--position", "position", "--torque", "torque")
 COLUMNS = ("--position-columns", "q", "--torque-columns", "u")
@@ -44,6 +45,15 @@ def test_numbers_are_those_of_the_library(table: Path, tmp_path: Path) -> None:
         assert printed[address]["value"] == pytest.approx(truth, rel=0.02)
         assert printed[address]["verdict"] == "accepted"
     assert load_scenario(f"{SCENARIO}@{saved}").pedigree.numbers[MASS].source == "calibrated"
+
+
+@pytest.mark.slow
+def test_friction_of_all_drives_is_one_option(table: Path) -> None:
+    program = run(
+        "calibrate", SCENARIO, table, *SIGNALS, *COLUMNS, "--vary", f"{MASS}=0.3:3", "--vary", "drives", "--json"
+    )
+    printed = {each["address"]: each["value"] for each in json.loads(program.stdout)["parameters"]}
+    assert printed == pytest.approx({MASS: 1.4, COULOMB: 0.2, VISCOUS: 0.01}, rel=0.05)
 
 
 def test_what_is_not_accepted_is_told_by_the_exit_code(table: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
@@ -30,14 +31,52 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
 
 
+# Largest torque of a signal without bounds, in N m or N.
+_LARGEST = 100.0
+_ALL_DRIVES = "drives"
+
+
+def _parse_varied(text: str) -> Any:
+    """Return a Parameter, or the word for all drives."""
+    return text if text == _ALL_DRIVES else parse_scaled_range(text)
+
+
+def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[Parameter]:
+    """Return the parameters, with those of all drives in place of the word.
+
+    Raises:
+        click.UsageError: The scenario has no drives.
+    """
+    if _ALL_DRIVES not in parameters:
+        return list(parameters)
+    from vtbdrake.optimization import Parameter
+
+    addresses = [address for address in scenario.build().variables() if address.startswith("sim.act.")]
+    found = [address.removesuffix(".coulomb") for address in addresses if address.endswith(".coulomb")]
+    if len(found) != 1:
+        raise click.UsageError(f"--vary drives is for a scenario with one JointDrives, this one has {len(found)}")
+    signal = next((each for each in scenario.interface().act if each.name == torque), None)
+    given = {each.address for each in parameters if each != _ALL_DRIVES}
+    bounds = np.broadcast_to(
+        np.inf if signal is None else np.asarray(signal.upper, float), (signal.size if signal else 1,)
+    )
+    drives = []
+    for i, bound in enumerate(bounds):
+        largest = float(bound) if np.isfinite(bound) else _LARGEST
+        addresses = [f"{found[0]}.{name}[{i}]" for name in ("coulomb", "viscous")]
+        drives += [Parameter(address, 0.0, largest) for address in addresses if address not in given]
+    return [*(each for each in parameters if each != _ALL_DRIVES), *drives]
+
+
 @click.command()
 @scenario_argument
 @click.argument("logs", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @option(
     "--vary ADDRESS=LOWER:UPPER",
-    "A number of the plant or of its drives, and its range. May be repeated.",
+    "A number of the plant or of its drives, and its range; or `drives`: Coulomb and viscous friction of all joints, "
+    "from 0 to the bounds of the torque. May be repeated.",
     name="parameters",
-    parse=parse_scaled_range,
+    parse=_parse_varied,
     multiple=True,
 )
 @option("--inertia ADDRESS", "A body whose ten inertial parameters are fitted. May be repeated.", multiple=True)
@@ -77,7 +116,7 @@ if TYPE_CHECKING:
 def calibrate(
     scenario: Scenario,
     logs: tuple[Path, ...],
-    parameters: tuple[Parameter, ...],
+    parameters: tuple[Any, ...],
     inertia: tuple[str, ...],
     position: str,
     torque: str,
@@ -118,6 +157,7 @@ def calibrate(
     from vtbdrake.calibration import calibrate as fit
     from vtbdrake.calibration import self_test as test
 
+    varied = _varied(scenario, torque, parameters)
     model: dict[str, Any] = {
         "inertias": [Inertia(address) for address in inertia],
         "position": position,
@@ -128,10 +168,10 @@ def calibrate(
     if self_test:
         machine = MachineConfig(disturbance={torque: disturbance} if disturbance else {})
         trial: dict[str, Any] = {"seconds": seconds, "trials": trials, "seed": seed, "values": settings(values)}
-        tested = test(scenario, parameters, machine=machine, **trial, **model)
+        tested = test(scenario, varied, machine=machine, **trial, **model)
         show(tested, _tested(tested))
         return
-    result = fit(scenario, [_read(path, scenario, position, torque, **table) for path in logs], parameters, **model)
+    result = fit(scenario, [_read(path, scenario, position, torque, **table) for path in logs], varied, **model)
     names = ("fit", "holdout", "correlation", "reasons", "combinations", "remarks")
     numbers = {"parameters": [*result.parameters.values()]}
     show(result, numbers | {name: getattr(result, name) for name in names})
