@@ -141,10 +141,10 @@ def fitted_to_predictions(logs: Sequence[Log], start: Mapping[str, float]) -> di
         start: Values to begin with, by address, of all numbers of `calibrated`.
     """
     testbed = DoublePendulumScenario().build()
-    kept = f"{PENDULUM}.lower.mass"
-    parameters = [vtb.Parameter(a, *ends) for a, ends in RANGES.items() if a != kept]
+    fixed = f"{PENDULUM}.lower.mass"
+    parameters = [vtb.Parameter(a, *ends) for a, ends in RANGES.items() if a != fixed]
     model = JointModel(testbed, parameters, measured_torque=True)
-    mass = float(testbed.read(testbed.default_context(), kept))
+    mass = float(testbed.read(testbed.default_context(), fixed))
     begin = {**start, **_with_mass(start, mass)}
     recordings = [JointRecording.of(log, model, position=POSITION, torque=TORQUE) for log in logs]
     states, times, *series = zip(*(window for each in recordings for window in _windows(each)), strict=True)
@@ -178,7 +178,7 @@ def fitted_to_predictions(logs: Sequence[Log], start: Mapping[str, float]) -> di
         f_scale=_LARGE_ERROR,
         max_nfev=_EVALUATIONS,
     )
-    return {kept: mass, **dict(zip(model.names, fit.x.tolist(), strict=True))}
+    return {fixed: mass, **dict(zip(model.names, fit.x.tolist(), strict=True))}
 
 
 def _with_mass(values: Mapping[str, float], mass: float) -> dict[str, float]:

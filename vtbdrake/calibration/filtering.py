@@ -406,12 +406,12 @@ class Segments:
                 buffer.set_arg(i, argument.data)
             evaluate()
             parts = table.swapaxes(1, 2).reshape(self.steps, self.count, 2 * n, -1)
-            x, by_x, others = parts[..., 0].copy(), parts[..., 1 : 1 + 2 * n], parts[..., 1 + 2 * n :]
+            x, by_x, direct = parts[..., 0].copy(), parts[..., 1 : 1 + 2 * n], parts[..., 1 + 2 * n :]
             if derivatives is None:
                 derivatives = parts[..., 1:].copy()
             else:
                 derivatives = by_x @ derivatives
-                derivatives[..., 2 * n :] += others
+                derivatives[..., 2 * n :] += direct
         assert derivatives is not None
         A, by_m, slopes = np.split(derivatives, [2 * n, 2 * n + nu], axis=3)
         return x, A, by_m, slopes.copy()

@@ -22,6 +22,7 @@ from vtbdrake.cli.options import (
     settings,
 )
 from vtbdrake.cli.output import json_option, show
+from vtbdrake.common.arrays import Array
 from vtbdrake.machine.config import MachineConfig
 
 if TYPE_CHECKING:
@@ -52,19 +53,18 @@ def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[
     from vtbdrake.optimization import Parameter
 
     addresses = [address for address in scenario.build().variables() if address.startswith("sim.act.")]
-    found = [address.removesuffix(".coulomb") for address in addresses if address.endswith(".coulomb")]
-    if len(found) != 1:
-        raise click.UsageError(f"--vary drives is for a scenario with one JointDrives, this one has {len(found)}")
+    paths = [address.removesuffix(".coulomb") for address in addresses if address.endswith(".coulomb")]
+    if len(paths) != 1:
+        raise click.UsageError(f"--vary drives is for a scenario with one JointDrives, this one has {len(paths)}")
     signal = next((each for each in scenario.interface().act if each.name == torque), None)
-    given = {each.address for each in parameters if each != _ALL_DRIVES}
-    bounds = np.broadcast_to(
-        np.inf if signal is None else np.asarray(signal.upper, float), (signal.size if signal else 1,)
-    )
+    listed = {each.address for each in parameters if each != _ALL_DRIVES}
+    upper = np.inf if signal is None else signal.upper
+    bounds: Array = np.broadcast_to(np.asarray(upper, dtype=float), (1 if signal is None else int(signal.size or 1),))
     drives = []
     for i, bound in enumerate(bounds):
         largest = float(bound) if np.isfinite(bound) else _LARGEST
-        addresses = [f"{found[0]}.{name}[{i}]" for name in ("coulomb", "viscous")]
-        drives += [Parameter(address, 0.0, largest) for address in addresses if address not in given]
+        addresses = [f"{paths[0]}.{name}[{i}]" for name in ("coulomb", "viscous")]
+        drives += [Parameter(address, 0.0, largest) for address in addresses if address not in listed]
     return [*(each for each in parameters if each != _ALL_DRIVES), *drives]
 
 

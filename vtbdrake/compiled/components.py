@@ -339,7 +339,7 @@ class DriveEquations(Equations):
 
     def _torque(self, at: At, motor: Expression) -> Expression:
         arguments = [at.parameter(0), motor, at.state(0), at.state(2), at.input("state")]
-        return casadi.densify(self.system.friction.expression(arguments))
+        return casadi.densify(self.system.kernel.expression(arguments))
 
     def _last(self, at: At, torque: Expression) -> dict[int, Expression]:
         return {0: torque, 2: casadi.vertcat(at.input("state")[self.system.velocities], 1.0)}

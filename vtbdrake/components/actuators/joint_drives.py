@@ -148,7 +148,7 @@ class JointDrives(AddressedSystem):
         self.step: float = float(plant.time_step())  # step in s of a discrete plant, 0 of a continuous one
         self.motors = _motors(n, self.period)
         is_discrete, states = self.step > 0.0, plant.num_multibody_states()
-        self.friction = _friction(self.velocities, states, self.step or self.period, is_discrete)
+        self.kernel = _friction(self.velocities, states, self.step or self.period, is_discrete)
         self._declare_torque()
 
     def _declare_torque(self) -> None:
@@ -182,7 +182,7 @@ class JointDrives(AddressedSystem):
     def _torque_with(self, context: Context, motor: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the torques that the joints feel with the torques ``motor`` of their motors, each (n,)."""
         settings, before, last = (group.array(context) for group in (self._settings, self._torque, self._last))
-        return self.friction.value((settings, motor, before, last, self._state_port.Eval(context)))
+        return self.kernel.value((settings, motor, before, last, self._state_port.Eval(context)))
 
     def _remember(self, context: Context, state: DiscreteValues) -> None:
         self._set_last(context, state, self.get_output_port().Eval(context))
