@@ -356,7 +356,7 @@ class Segments:
         return compiled_if_possible(casadi.Function("calibration_step", [x, m, h, z], [table], {"cse": True}))
 
     def substeps(self, z: Array) -> int:
-        """Return the number of steps within a period: those of a discrete plant, or fine enough for friction near rest.
+        """Return the number of steps within a period: a discrete plant's, or enough for friction near rest.
 
         Args:
             z: The parameters, (nz,).

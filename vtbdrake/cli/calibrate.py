@@ -43,7 +43,7 @@ def _parse_varied(text: str) -> Any:
 
 
 def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[Parameter]:
-    """Return the parameters, with those of all drives in place of the word.
+    """Return the parameters, with the friction of all drives in place of the word.
 
     Raises:
         click.UsageError: The scenario has no drives.

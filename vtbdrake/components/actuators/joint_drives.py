@@ -296,8 +296,8 @@ def _friction(velocities: Sequence[int], states: int, period: float, is_discrete
         velocities: The places of the joints' velocities in [q; v].
         states: The number of entries of [q; v].
         period: The time for which the friction is held, in s.
-        is_discrete: The plant is discrete, whose damping acts at the end of a step; that of a continuous one is best
-            represented in the middle of a period.
+        is_discrete: The plant is discrete: viscous friction acts at the end of a step, as its damping; otherwise in the
+            middle of a period.
     """
     n = len(velocities)
     sizes = _sizes(n, values=None, motor=n, before=n, last=n + 1, x=states)
