@@ -257,7 +257,13 @@ def least_inertia(plant: MultibodyPlant, joints: Sequence[Joint]) -> NDArray[np.
 
 
 def friction_size(v: Expression, motor: Expression, law: Mapping[str, Expression]) -> Expression:
-    """Return the size of the friction beside the viscous one, in N m, (n, 1); the arguments are `friction_torque`'s."""
+    """Return the size of the friction beside the viscous one, in N m, (n, 1).
+
+    Args:
+        v: Velocities of the joints in rad/s, (n, 1).
+        motor: Torques of their motors in N m, (n, 1).
+        law: The numbers of `FRICTION`, by name, (n, 1) each.
+    """
     # A velocity of 0 makes the friction a step.
     near_rest = casadi.exp(-((v / casadi.fmax(law["stribeck_velocity"], _LEAST_EDGE)) ** 2))
     return law["coulomb"] + law["stribeck"] * near_rest + law["load_friction"] * casadi.fabs(motor)
@@ -327,7 +333,14 @@ def _friction(velocities: Sequence[int], states: int, period: float, is_discrete
 
 
 def end_velocity(a: Expression, b: Expression, rest: Expression, edge: Expression) -> Expression:
-    """Return w with a w + b tanh(w / edge) = rest, all (n, 1), for positive a, b and edge."""
+    """Return the velocities w with a w + b tanh(w / edge) = rest, (n, 1).
+
+    Args:
+        a: Positive numbers, (n, 1).
+        b: Numbers of 0 or more, (n, 1).
+        rest: The right-hand sides, (n, 1).
+        edge: The positive velocities below which the friction fades, (n, 1).
+    """
     # From the solution with a straight edge, Newton's method comes nearer from one side: tanh is concave.
     slides = casadi.fabs(rest) > a * edge + b
     w = casadi.if_else(slides, (rest - casadi.sign(rest) * b) / a, rest / (a + b / edge))
