@@ -24,7 +24,7 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 
 METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "random")
 # Methods that take a second or more for a decision: only by name, and with fewer seeds.
-SLOW = ("auto", "bayesian")
+SLOW = ("auto", "bayesian", "COBYQA")
 SEEDS = 15
 SEEDS_OF_SLOW = 3
 ROLLOUTS = (30, 100)

@@ -64,6 +64,7 @@ BENCHMARKS: Registry = {
     "study_against_optuna": "benchmarks.study:study_against_optuna",
     "auto_regret": "benchmarks.auto_regret:auto_regret",
     "auto_regret_full": "benchmarks.auto_regret:auto_regret_full",
+    "auto_regret_mixed": "benchmarks.auto_regret:auto_regret_mixed",
     "racing_savings": "benchmarks.study:racing_savings",
     "study_page_open": "benchmarks.study_page:study_page_open",
     "study_page_cost": "benchmarks.study_page:study_page_cost",

@@ -23,6 +23,7 @@ from vtbdrake.optimization.solvers.solver import BudgetTooSmallError, Point, Sol
 from vtbdrake.reasoning.belief import Belief, BeliefConfig, BeliefError, BeliefToStart
 from vtbdrake.reasoning.decision import Budget, Decision, check_budget
 from vtbdrake.reasoning.decision_run import DecisionRun
+from vtbdrake.reasoning.default_method import default_method
 from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Constraint, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
@@ -50,8 +51,10 @@ class SearchConfig:
 
     Attributes:
         method: Name of a solver from `vtbdrake.optimization.solvers` (``MPPI``, ``CEM``, ``predictive-sampling``,
-            ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
-        options: Options of the method.
+            ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`. By default it follows from the
+            kind of decision: ``grid`` for few choices, ``CMA-ES`` with words, ``COBYQA`` for up to four numbers in a
+            budget of rollouts without pruning, and else ``MPPI``.
+        options: Options of the method, which is named then.
         pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
             one before its round of 8 candidates, if there is one sample or the risk is ``worst``. Methods that learn
             from all points, such as CEM and MPPI, propose other candidates with pruning than without.
@@ -64,10 +67,10 @@ class SearchConfig:
             By default the horizon, but at least 10 s.
 
     Raises:
-        ValueError: The options are no mapping.
+        ValueError: The options are no mapping, or belong to no method.
     """
 
-    method: str | type[Solver] = "MPPI"
+    method: str | type[Solver] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     pruning: Pruning | None = None
     executor: str | Executor = "auto"
@@ -77,6 +80,8 @@ class SearchConfig:
     def __post_init__(self) -> None:
         if not isinstance(self.options, Mapping):
             raise ValueError(f"options are given by name, such as {{'samples': 24}}, not as {self.options!r}")
+        if self.options and self.method is None:
+            raise ValueError(f"options are those of a method, which method= names; {dict(self.options)!r} are of none")
 
 
 class Reasoner:
@@ -222,14 +227,16 @@ class Reasoner:
             budget: Number of candidates that the method may propose; None: any number.
             start: Where the method starts, if it starts at a point.
         """
+        timed = self.budget.seconds is not None or self._search.pruning is not None
+        method = self._search.method or default_method(self.space.elements, candidates=None if timed else budget)
         entropy = [self._seed, int(np.float64(time).view(np.uint64))]
         return make_solver(
-            self._search.method,
+            method,
             self.space.parameters,
             constraints=len(self.problem.constraints),
             seed=int(np.random.SeedSequence(entropy).generate_state(1)[0]),
             budget=budget,
-            start=start if solver_type(self._search.method).takes_start else None,
+            start=start if solver_type(method).takes_start else None,
             **self._search.options,
         )
 

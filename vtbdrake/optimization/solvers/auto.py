@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
+from vtbdrake.optimization.parameter import Choice
 from vtbdrake.optimization.solvers.bayesian import Bayesian
 from vtbdrake.optimization.solvers.cobyqa import Cobyqa
 from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
-from vtbdrake.optimization.solvers.drake_solvers import Nlopt
 from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution, default_population
 from vtbdrake.optimization.solvers.solver import SEEDS, Evaluation, Point, Search, Solver, best_of, rank_key
 
@@ -23,264 +22,241 @@ MODEL = "bayesian"
 EXHAUSTIVE = 256
 # A change of the best value is progress if it exceeds this part of the spread of the values found by the model.
 PROGRESS = 1e-6
-# The solver ends after this many starts in a row without progress.
+# The solver ends after this many global starts in a row without progress.
 PATIENCE = 5
-# A Gaussian process helps with up to this many parameters; beyond, a quadratic model is expensive, too.
+# A Gaussian process and a quadratic model help with up to this many parameters; beyond, both are expensive.
 MODEL_SIZE = 20
-# Points of the model per parameter and one more.
+# Beyond this number of parameters, a Gaussian process with few points tells little: evolution takes its place.
+PROCESS_SIZE = 12
+# Points of the Gaussian process per parameter and one more.
 MODEL_POINTS = 25
-# Largest number of points of the model.
+# Largest number of points of the Gaussian process.
 MODEL_LIMIT = 120
-# Least number of batches of points of the model, where batches are wide.
+# Least number of batches of points of the Gaussian process, where batches are wide.
 MODEL_BATCHES = 4
-# Least number of generations that CMA-ES needs.
-GENERATIONS = 10
-# Without generations, the budget that is left divided by this number goes to a local search.
-LOCAL_PART = 3
-# A local search needs at least this number of points per continuous parameter and one more: the 2 n + 1 of BOBYQA's
-# first model, and some steps.
-LOCAL_POINTS = 5
-# Half width of the box of the local search after the model, as a part of the ranges.
+# Closest points that the Gaussian process learns from the other methods, as a part of the ranges.
+MODEL_SPACING = 0.005
+# The radius with which the first local search begins, as a part of the ranges.
+FIRST_RADIUS = 0.35
+# The radius of the later ones.
 LOCAL_RADIUS = 0.1
-# Half width of the box of the last local search.
-POLISH_RADIUS = 0.02
-# Half width of the box of local searches in other basins.
-BASIN_RADIUS = 0.2
-# Tolerance at which they end.
-BASIN_TOLERANCE = 1e-3
-# Number of basins in a row that may have nothing better.
-BASINS = 3
+# A local search has located its minimum when its best point moves by less than this part of the ranges.
+LOCATED = 0.003
+# A point that is closer than this to the start or the end of a local search is in its basin.
+BASIN = 0.1
+# The least share of a method that does not pay, relative to one that does.
+LEAST_SHARE = 0.125
+# A method does not pay if it has this many evaluations per parameter and two more without progress of the best point.
+TRIAL = 2
+# The standard deviation of a hop from the best point into a basin beside it, as a part of the ranges.
+HOP = 0.1
+# Local searches in a row that may have nothing better, before the others find something better.
+BASINS = 6
+# Evolution beside the model begins around the best point with this standard deviation.
+EVOLUTION_WIDTH = 0.15
+
+
+@dataclass(eq=False)
+class _Arm:
+    """A method of the portfolio.
+
+    Attributes:
+        method: Its name, for the user.
+        solver: The solver that runs it.
+        patience: The number of evaluations without progress after which it stalls.
+        limit: The number of evaluations after which it ends.
+        start: The start of a local search, whose integers stay; None of a global method.
+        before: The best evaluation of all when it began.
+        spent: The number of its evaluations.
+        best: Its best evaluation.
+        without_progress: The number of its evaluations since its best one.
+        path: The place of its best point after each evaluation of a local search, in the unit cube.
+        ended: Whether it has ended.
+    """
+
+    method: str
+    solver: Solver
+    patience: float = math.inf
+    limit: float = math.inf
+    start: Point | None = None
+    before: Evaluation | None = None
+    spent: int = 0
+    best: Evaluation | None = None
+    without_progress: int = 0
+    path: list[np.ndarray] = field(default_factory=list)
+    ended: bool = False
+
+
+@dataclass(eq=False)
+class _Account:
+    """The evaluations of methods of one kind, weighed by what they bring.
+
+    Attributes:
+        due: The evaluations so far, each divided by the share at its time: the least one is next.
+        share: 1 while the methods pay, less while they do not.
+        fruitless: The number of evaluations since the last progress, or the last change of the share.
+    """
+
+    due: float = 0.0
+    share: float = 1.0
+    fruitless: int = 0
+
+    def charge(self, count: int, progress: bool, trial: int) -> None:
+        """Charge evaluations, which have improved the best point or not."""
+        self.due += count / self.share
+        self.fruitless = 0 if progress else self.fruitless + count
+        if progress:
+            self.share = 1.0
+        elif self.fruitless >= trial:
+            self.share, self.fruitless = max(self.share / 2.0, LEAST_SHARE), 0
 
 
 class Auto(Solver):
-    """A solver that chooses its methods by the problem.
+    """A solver that chooses its methods by the problem, and spends evaluations on those that pay.
 
     * whole and categorical parameters only, with no more combinations than the budget (256 without one), and one
       objective: a grid;
     * several objectives, or a categorical parameter: Bayesian optimization to the end;
-    * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most; a local search from its
-      best point, for at most a third of the remaining budget, and another one while it ends at the border of its box;
-      local searches from the best points outside of the basins that were searched, until three in a row have found
-      nothing better; then CMA-ES from the best point. A budget that leaves less than ten generations for CMA-ES goes to
-      Bayesian optimization for two thirds, and for one to a local search from its best point; all of it goes to
-      Bayesian optimization if the third is less than 5 (k + 1) points for k continuous parameters;
-    * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
+    * else a portfolio of a local search and of global methods, which take turns.
 
-    Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations. If more
-    points run side by side (`Search.parallel`), every method asks for as many at a time, Bayesian optimization in at
-    least four batches, and the local searches, which choose each point by the last one, are left out.
+    The *local search* is COBYQA: quadratic models in a trust region. It begins at once, in the middle of the ranges or
+    at the given start, and has all evaluations until it has *located* a minimum: until its best point moves by less
+    than 0.3 % of the ranges in n + 5 evaluations. From then on it takes turns with the others, until it has converged;
+    one that locates a minimum that is not the best ends there. The next one begins at the best point, if another method
+    has found that, and else in turns beside the best point and at the best point far from all basins that were
+    searched. After six in a row without a better point they wait until another method finds one. They vary the
+    continuous parameters only, and keep the integers of the start.
 
-    CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
-    each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
-    Then it restarts at a random point with twice the population (IPOP); every third start is differential evolution.
-    After five starts in a row without such an improvement the solver ends, with success. Last, if the best point is
-    better than the model's, a tenth of the budget at most goes into another local search, and the rest into
-    Bayesian optimization.
+    The *global methods* are Bayesian optimization for 25 (n + 1) points, 120 at most, which learns from the points of
+    all methods, with up to 12 parameters; and evolution: CMA-ES from the best point, which ends when it has converged,
+    or when it stalls: when for 20 + 30 n / lambda generations, of lambda points each, its best value has not improved
+    by more than 1e-6 of the spread of all values. Then it restarts at a random point with twice the population (IPOP);
+    every third start is differential evolution. After five starts in a row without such an improvement the solver ends,
+    with success. With more than 20 parameters, or if more points run side by side (`Search.parallel`), there are no
+    local searches, which choose each point by the last one: a Sobol design of 2 (n + 1) points, or else Bayesian
+    optimization, comes first, then evolution.
 
-    The local searches (BOBYQA, or COBYQA with constraints or one continuous parameter) stay in a box around the point
-    from which they begin, and keep its integers. They need at most 20 parameters, at least one of them continuous.
+    *Turns* are given by what pays. Local search, Bayesian optimization and evolution have equal shares at first. The
+    share of one is halved, to an eighth at least, whenever 2 (n + 2) of its evaluations have not improved the best
+    point, and is full again once it improves it. Methods ask for one point at a time, evolution for a generation; for
+    as many as run side by side, if that is more. No choice depends on the budget, a grid's excepted: with a larger
+    budget, a study begins as with a smaller one.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
+    Ragonneau, T. M. (2022): Model-based derivative-free optimization methods and software, PhD thesis, The Hong Kong
+    Polytechnic University.
     """
 
     def __init__(self, search: Search, *, name: str) -> None:
         super().__init__(search, name=name)
         self._best: Evaluation | None = None
-        self._spread = 0.0
+        self._lowest_value, self._highest_value = math.inf, -math.inf
         self._count = 0
-        self._method = ""
         self._changes: list[tuple[int, str]] = []
-        self._solver: Solver
-        self._patience = math.inf
-        self._limit = math.inf
+        # All evaluations of one objective, by their points.
+        self._known: dict[Point, Evaluation] = {}
+        # Their places in the unit cube.
+        self._places: dict[Point, np.ndarray] = {}
+        # Those that the Gaussian process was not told of yet, and the places of those that it was told of.
+        self._untold: list[Evaluation] = []
+        self._told_places: list[np.ndarray] = []
         # Whether one method performs the whole search.
         self._alone = False
-        # The start of a local search, whose integers stay.
-        self._local_start: Point | None = None
-        # The starts of all local searches.
-        self._searched: list[Point] = []
-        self._stage_best: Evaluation | None = None
-        self._without_progress = 0
-        # The evaluations of the first stages; a new model is fitted to them.
-        self._before: list[Evaluation] = []
+        self._arm: _Arm
+        # Starts and ends of local searches, and their places in the unit cube.
+        self._ends: set[Point] = set()
+        self._basins: list[np.ndarray] = []
+        self._local: _Arm | None = None
+        self._local_count = 0
+        self._fruitless_basins = 0
+        self._accounts = {kind: _Account() for kind in ("local", "model", "evolution")}
+        self._arms: list[_Arm] = []
         self._plan = self._stages()
-        next(self._plan)
 
     @property
     def method(self) -> str:
-        return self._method
+        return self._changes[-1][1] if self._changes else self._arm.method if self._alone else ""
 
     @property
     def changes(self) -> tuple[tuple[int, str], ...]:
-        """Return the methods used so far, each with the number of evaluations asked for before it began."""
+        """Return the methods used so far, each with the number of evaluations asked for before its turn."""
         return tuple(self._changes)
 
     def change_budget(self, left: float) -> None:
         super().change_budget(left)
         if self._alone:
-            self._solver.change_budget(left)
-        elif self._patience < math.inf:
-            # A global method has all that is left; the others are limited by their plans.
-            self._solver.change_budget(self._left_but_polish())
+            self._arm.solver.change_budget(left)
 
     # -- the plan
 
-    def _stages(self) -> Iterator[None]:
-        """Yield once per method; the caller resumes when that has ended or stalled."""
+    def _stages(self) -> Iterator[_Arm]:
+        """Yield the method of each batch."""
         search = self.search
         discrete = not any(parameter.is_continuous for parameter in search.space)
         if search.objectives == 1 and discrete and discrete_size(search.space) <= (search.budget or EXHAUSTIVE):
             return self._one("grid", Grid(replace(search, start=None), name="grid"))
         if search.objectives > 1 or any(isinstance(parameter, Choice) for parameter in search.space):
             return self._one(MODEL, Bayesian(search, name=MODEL, batch=self._batch))
-        return self._global_stages()
+        return self._portfolio()
 
-    def _one(self, method: str, solver: Solver) -> Iterator[None]:
+    def _one(self, method: str, solver: Solver) -> Iterator[_Arm]:
         self._alone = True
-        self._begin(method, solver)
-        yield
-        self._end(bool(solver.success), solver.message)
+        self._arm = self._new_arm(method, solver)
+        return self._to_the_end(self._arm)
+
+    def _to_the_end(self, arm: _Arm) -> Iterator[_Arm]:
+        while not arm.ended:
+            yield arm
+        self._end(bool(arm.solver.success), arm.solver.message)
 
     @property
     def _batch(self) -> int:
-        """Return the number of points that the model asks for at a time; 1 with a small budget, to learn from each."""
+        """Return the number of points that Bayesian optimization to the end asks for at a time."""
         return self.search.batch(4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4))
 
-    def _global_stages(self) -> Iterator[None]:
+    def _portfolio(self) -> Iterator[_Arm]:
         search = self.search
         if search.start is not None:
-            self._begin("start", Listed(replace(search, start=None, budget=None), name="start", points=[search.start]))
-            yield
-        reserve = self._local_reserve()
-        self._begin_model(reserve)
-        yield
-        model_best = self._best
-        if model_best is not None and self._has_local:
-            yield from self._descent(model_best.point, whole=reserve > 0)
-            yield from self._other_basins()
-        fruitless, start = 0, 0
-        least = self._generations if reserve else 0
-        while fruitless < PATIENCE and self._left_but_polish() > least:
-            before = self._best
-            self._begin_global(start)
-            yield
-            start += 1
-            fruitless = 0 if self._progress(before, self._best) else fruitless + 1
-        if self._has_local and self._progress(model_best, self._best):
-            assert self._best is not None
-            self._begin_local(self._best.point, radius=POLISH_RADIUS, limit=math.inf)
-            yield
-        if fruitless == PATIENCE:
-            self._end(True, f"{PATIENCE} starts in a row found nothing better")
-            return
-        while self._left:
-            self._begin_model()
-            yield
-        self._spent()
+            first = Listed(replace(search, start=None, budget=None), name="start", points=[search.start])
+            yield self._new_arm("start", first)
+        if self._has_local:
+            by_hand = self._best.point if self._best is not None and search.start is None else None
+            self._begin_local(by_hand or search.start or search.point(search.start_unit()), radius=FIRST_RADIUS)
+            while self._local is not None and not self._is_located(self._local):
+                yield self._local
+                self._look_at_local()
+        yield from self._turns()
+        self._end(True, f"{PATIENCE} starts in a row found nothing better")
 
-    def _descent(self, start: Point, *, whole: bool) -> Iterator[None]:
-        """Search locally from a point; go on in another box while the best point lies at the border of its own.
+    def _turns(self) -> Iterator[_Arm]:
+        """Yield the method of each batch, once a minimum is located: the one that is due by its account."""
+        # Side by side in the first case, one after the other in the second.
+        beside = self._has_local and self.search.size <= PROCESS_SIZE
+        model = self._new_model() if not self._has_local or beside else None
+        evolutions = self._evolutions()
+        evolution: _Arm | None = None
+        while True:
+            if evolution is None and (beside or model is None):
+                evolution = next(evolutions, None)
+                if evolution is None and model is None:
+                    return
+            local = self._local_search()
+            arms = {"local": local, "model": model, "evolution": evolution}
+            kinds = [kind for kind, arm in arms.items() if arm is not None]
+            kind = min(kinds, key=lambda kind: self._accounts[kind].due)
+            arm = arms[kind]
+            assert arm is not None
+            count, before = self._count, self._best
+            yield arm
+            progress = self._progress(before, self._best)
+            self._accounts[kind].charge(self._count - count, progress, TRIAL * (self.search.size + 2))
+            if progress:
+                self._fruitless_basins = 0
+            self._look_at_local()
+            model = None if model is None or model.ended else model
+            evolution = None if evolution is None or evolution.ended else evolution
 
-        A search gets the ``whole`` of what is left, or else a third of it, without the reserve for the last search.
-        """
-        while self._left_but_polish() > 0:
-            limit = math.inf if whole else self._left_but_polish() / 3.0
-            self._begin_local(start, radius=LOCAL_RADIUS, limit=limit)
-            yield
-            end = self._stage_best
-            if end is None:
-                return
-            u, moved = self.search.unit(end.point), np.abs(self.search.unit(end.point) - self.search.unit(start))
-            if not ((moved > 0.99 * LOCAL_RADIUS) & (u > 0.0) & (u < 1.0))[self._continuous].any():
-                return
-            start = end.point
-
-    def _other_basins(self) -> Iterator[None]:
-        """Search locally from the best points that lie outside of the basins known so far, while that pays."""
-        fruitless = 0
-        while fruitless < BASINS and self._left_but_polish() > self._local_limit:
-            start = self._outside()
-            if start is None:
-                return
-            before = self._best
-            self._begin_local(start, radius=BASIN_RADIUS, limit=math.inf, tolerance=BASIN_TOLERANCE)
-            yield
-            fruitless = 0 if self._progress(before, self._best) else fruitless + 1
-
-    def _outside(self) -> Point | None:
-        """Return the best point of the model that is far from the starts and ends of all local searches."""
-        assert self._best is not None
-        centres = [self.search.unit(point) for point in [*self._searched, self._best.point]]
-        for evaluation in sorted((e for e in self._before if e.counts), key=rank_key):
-            u = self.search.unit(evaluation.point)
-            if all(np.abs(u - centre).max() > LOCAL_RADIUS for centre in centres):
-                return evaluation.point
-        return None
-
-    def _begin_model(self, reserve: int = 0) -> None:
-        """Begin the Gaussian process, or for many parameters a design; leave ``reserve`` points of a small budget."""
-        search, size, left = self.search, self.search.size, math.inf if self._left is None else self._left
-        if size > MODEL_SIZE:
-            points = int(min(search.batch(2 * (size + 1)), max(1, left // 2)))
-            self._begin("sobol", Sobol(replace(search, start=None, budget=None), name="sobol", points=points))
-            return
-        points = int(left) - reserve if self._is_small else self._model_points
-        model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
-        # These evaluations are charged already.
-        model.tell([replace(evaluation, effort=0.0) for evaluation in (*self._before, self._best) if evaluation])
-        # With racing, the budget may allow many more points: the number of points is limited, too.
-        self._begin(MODEL, model, limit=points)
-
-    @property
-    def _model_points(self) -> int:
-        """Return the number of points of the model in a large budget."""
-        return max(min(MODEL_POINTS * (self.search.size + 1), MODEL_LIMIT), MODEL_BATCHES * self.search.batch(1))
-
-    @property
-    def _is_small(self) -> bool:
-        """Return whether the budget left is too small for the model and CMA-ES."""
-        return self._left is not None and self._left < self._model_points + self._generations
-
-    @property
-    def _generations(self) -> int:
-        """Return the number of evaluations that CMA-ES needs at least."""
-        return GENERATIONS * self.search.batch(default_population(self.search.size))
-
-    def _local_reserve(self) -> int:
-        """Return the number of evaluations that the model leaves to a local search in a small budget."""
-        if not (self._has_local and self._is_small):
-            return 0
-        assert self._left is not None
-        points = self._left // LOCAL_PART
-        return points if points >= LOCAL_POINTS * (len(self._continuous) + 1) else 0
-
-    def _begin_global(self, start: int) -> None:
-        """Begin a global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
-        left = self._left_but_polish()
-        search = replace(
-            self.search,
-            start=None,
-            seed=(self.search.seed + start) % SEEDS,
-            budget=None if self._left is None else int(left),
-        )
-        if start % 3 == 2:
-            self._begin(
-                f"differential-evolution, start {start + 1}",
-                DifferentialEvolution(search, name="differential-evolution"),
-                generation=search.batch(15 * search.size),
-            )
-            return
-        population = search.batch(default_population(search.size)) << (start - start // 3)
-        if start == 0 and self._best is not None:
-            search = replace(search, start=self._best.point)
-        else:
-            generator = np.random.default_rng([self.search.seed, start])
-            search = replace(search, start=search.point(generator.random(search.size)))
-        self._begin(
-            f"CMA-ES, start {start + 1}, population {population}",
-            CmaEs(search, name="CMA-ES", population=population),
-            generation=population,
-        )
+    # -- local searches
 
     @property
     def _has_local(self) -> bool:
@@ -291,104 +267,216 @@ class Auto(Solver):
         """Return the indices of the continuous parameters."""
         return [i for i, parameter in enumerate(self.search.space) if parameter.is_continuous]
 
-    @property
-    def _local_limit(self) -> int:
-        """Return the largest number of evaluations of a local search."""
-        return 20 * (len(self._continuous) + 1)
+    def _local_search(self) -> _Arm | None:
+        """Return the local search under way, or a new one; None if there is no place for one that may pay."""
+        if self._local is None and self._has_local and self._fruitless_basins < BASINS:
+            start = self._next_start()
+            if start is not None:
+                self._begin_local(start, radius=LOCAL_RADIUS)
+        return self._local
 
-    def _left_but_polish(self) -> float:
-        """Return the number of evaluations left for global methods."""
-        if self._left is None or self.search.budget is None:
-            return math.inf
-        reserve = min(self.search.budget // 10, self._local_limit) if self._has_local else 0
-        return self._left - reserve
+    def _next_start(self) -> Point | None:
+        """Return the start of the next local search; None if there is none.
 
-    def _begin_local(self, start: Point, *, radius: float, limit: float, tolerance: float | None = None) -> None:
+        It is the best point if no local search has found that; else in turns a place beside the best point, and the
+        best point that is far from the starts and ends of all local searches.
+        """
+        best = self._best
+        if best is None or not best.counts:
+            return None
+        if best.point not in self._ends:
+            return best.point
+        if self._local_count % 2:
+            varied, u = self._continuous, self.search.unit(best.point)
+            u[varied] += HOP * np.random.default_rng([self.search.seed, self._local_count]).normal(size=len(varied))
+            beside = self.search.point(np.clip(u, 0.0, 1.0))
+            return tuple(beside[i] if i in varied else value for i, value in enumerate(best.point))
+        evaluations = [evaluation for evaluation in self._known.values() if evaluation.counts]
+        places = np.array([self._places[evaluation.point] for evaluation in evaluations])
+        free = np.ones(len(evaluations), dtype=bool)
+        for basin in self._basins:
+            free &= np.abs(places - basin).max(axis=1) > BASIN
+        far = min((evaluations[i] for i in np.flatnonzero(free)), key=rank_key, default=best)
+        return far.point
+
+    def _begin_local(self, start: Point, *, radius: float) -> None:
         """Begin a local search at a point, whose integers stay."""
         varied = self._continuous
-        u = self.search.unit(start)
-        self._searched.append(start)
-        lower = self.search.point(np.maximum(u - radius, 0.0))
-        upper = self.search.point(np.minimum(u + radius, 1.0))
-        box = tuple(_between(self.search.space[i], lower[i], upper[i]) for i in varied)
-        # BOBYQA takes no constraints, and at least two parameters.
-        name = "COBYQA" if self.search.constraints or len(varied) == 1 else "LN_BOBYQA"
-        budget = int(max(1, min(limit, self._local_limit)))
-        search = replace(self.search, space=box, start=tuple(start[i] for i in varied), budget=budget)
-        place = "around the best" if self._best is None or start == self._best.point else "in another basin"
-        options: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
-        make = Cobyqa if name == "COBYQA" else Nlopt
-        self._begin(f"{name} {place}", make(search, name=name, **options))
-        self._local_start = start
+        self._end_at(start)
+        space, point = tuple(self.search.space[i] for i in varied), tuple(start[i] for i in varied)
+        search = replace(self.search, space=space, start=point, budget=None)
+        place = "from the start"
+        if self._local_count:
+            place = "around the best" if self._best is not None and start == self._best.point else "in another basin"
+        self._local_count += 1
+        self._local = self._new_arm(f"COBYQA {place}", Cobyqa(search, name="COBYQA", radius=radius), start=start)
 
-    # -- its steps
+    def _end_at(self, point: Point) -> None:
+        """Note the start or the end of a local search."""
+        self._ends.add(point)
+        self._basins.append(self.search.unit(point))
 
-    def _begin(self, method: str, solver: Solver, *, generation: int | None = None, limit: float = math.inf) -> None:
-        """Begin a method.
+    def _is_located(self, local: _Arm) -> bool:
+        """Return whether the best point of a local search hardly moves any more."""
+        size = len(self._continuous)
+        window = size + 5
+        if len(local.path) <= 2 * size + 1 + window:
+            return False
+        return bool(np.abs(local.path[-1] - local.path[-1 - window]).max() < LOCATED)
 
-        Args:
-            method: Name of the method, for the user.
-            solver: The solver that runs it.
-            generation: Points per generation of a method that may stall; None if it cannot.
-            limit: The number of points after which the method ends.
-        """
-        self._method = method
-        self._local_start = None
-        self._changes.append((self._count, method))
-        self._solver = solver
-        self._stage_best = None
-        self._without_progress = 0
-        self._limit = self._count + limit
-        self._patience = math.inf if generation is None else 20.0 * generation + 30.0 * self.search.size
+    def _look_at_local(self) -> None:
+        """End the local search if it has converged, or has located a minimum that is not the best."""
+        local = self._local
+        if local is None or not (local.ended or (self._is_located(local) and local.best is not self._best)):
+            return
+        if local.best is not None:
+            self._end_at(local.best.point)
+        self._fruitless_basins += local.best is not self._best
+        local.solver.close()
+        self._local = None
+
+    # -- global methods
+
+    def _evolutions(self) -> Iterator[_Arm]:
+        """Yield evolutionary methods, each to its end, until none has found anything better for a while."""
+        fruitless, start = 0, 0
+        while fruitless < PATIENCE:
+            arm = self._new_evolution(start)
+            yield arm
+            start += 1
+            fruitless = 0 if self._progress(arm.before, arm.best) else fruitless + 1
+
+    def _new_model(self) -> _Arm:
+        """Return the Gaussian process, or for many parameters a design."""
+        search, size = replace(self.search, start=None, budget=None), self.search.size
+        if size > MODEL_SIZE:
+            points = int(search.batch(2 * (size + 1)))
+            if self.search.budget is not None:
+                points = min(points, max(1, self.search.budget // 2))
+            return self._new_arm("sobol", Sobol(search, name="sobol", points=points))
+        model = Bayesian(search, name=MODEL, batch=self.search.batch(1))
+        points = max(min(MODEL_POINTS * (size + 1), MODEL_LIMIT), MODEL_BATCHES * search.batch(1))
+        return self._new_arm(MODEL, model, limit=points)
+
+    def _new_evolution(self, start: int) -> _Arm:
+        """Return a global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
+        search = replace(self.search, start=None, seed=(self.search.seed + start) % SEEDS, budget=None)
+        if start % 3 == 2:
+            evolution = DifferentialEvolution(search, name="differential-evolution")
+            generation = search.batch(15 * search.size)
+            return self._stalling(f"differential-evolution, start {start + 1}", evolution, generation)
+        population = search.batch(default_population(search.size)) << (start - start // 3)
+        if start == 0 and self._best is not None:
+            search = replace(search, start=self._best.point)
+        else:
+            generator = np.random.default_rng([self.search.seed, start])
+            search = replace(search, start=search.point(generator.random(search.size)))
+        width = EVOLUTION_WIDTH if start == 0 and self._has_local else 0.3
+        strategy = CmaEs(search, name="CMA-ES", population=population, sigma=width)
+        return self._stalling(f"CMA-ES, start {start + 1}, population {population}", strategy, population)
+
+    def _stalling(self, method: str, solver: Solver, generation: int) -> _Arm:
+        """Return a method that may stall, of ``generation`` points at a time."""
+        return self._new_arm(method, solver, patience=20.0 * generation + 30.0 * self.search.size)
+
+    # -- steps
+
+    def _new_arm(self, method: str, solver: Solver, **settings: Any) -> _Arm:
+        arm = _Arm(method, solver, before=self._best, **settings)
+        self._arms.append(arm)
+        return arm
 
     def _next(self) -> list[Point]:
         while self.success is None:
-            ended = self._without_progress > self._patience or self._count >= self._limit
-            points = [] if ended else [self._with_integers(point) for point in self._solver.ask()]
+            arm = next(self._plan, None)
+            if arm is None:
+                break
+            self._arm = arm
+            points = self._asked(arm)
             if points:
+                if not self._changes or self._changes[-1][1] != arm.method:
+                    self._changes.append((self._count, arm.method))
                 self._count += len(points)
                 return points
-            self._solver.close()
-            next(self._plan, None)
+            arm.ended = True
+            arm.solver.close()
         return []
 
-    def _with_integers(self, point: Point) -> Point:
+    def _asked(self, arm: _Arm) -> list[Point]:
+        """Return the next points of a method; what is known already, it is told at once."""
+        if arm.without_progress > arm.patience or arm.spent >= arm.limit:
+            return []
+        if arm.solver.name == MODEL and not self._alone:
+            self._tell_model(arm.solver)
+        while asked := arm.solver.ask():
+            points = [self._completed(arm, point) for point in asked]
+            known = [self._known[point] for point in points if point in self._known]
+            if self._alone or len(known) < len(points):
+                return points
+            arm.solver.tell([replace(e, point=point) for e, point in zip(known, asked, strict=True)])
+            self._follow(arm, known)
+        return []
+
+    def _tell_model(self, model: Solver) -> None:
+        """Tell the Gaussian process of the points of the other methods that are not too close to each other."""
+        news = []
+        for evaluation in self._untold:
+            u = self._places[evaluation.point]
+            if evaluation is self._best or all(np.abs(u - v).max() > MODEL_SPACING for v in self._told_places):
+                news.append(evaluation)
+                self._told_places.append(u)
+        self._untold.clear()
+        if news:
+            model.tell(news)
+
+    def _completed(self, arm: _Arm, point: Point) -> Point:
         """Return a point of the method, completed by the integers of the start."""
-        if self._local_start is None:
+        if arm.start is None:
             return point
         varied = dict(zip(self._continuous, point, strict=True))
-        return tuple(varied.get(i, value) for i, value in enumerate(self._local_start))
+        return tuple(varied.get(i, value) for i, value in enumerate(arm.start))
 
-    def _without_integers(self, point: Point) -> Point:
-        return point if self._local_start is None else tuple(point[i] for i in self._continuous)
+    def _reduced(self, arm: _Arm, point: Point) -> Point:
+        return point if arm.start is None else tuple(point[i] for i in self._continuous)
 
     def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
-        self._solver.tell([replace(e, point=self._without_integers(e.point)) for e in (*evaluations, *by_hand)])
-        if self.search.objectives > 1:
+        if self._alone:
+            self._arm.solver.tell([*evaluations, *by_hand])
             return
-        if not self._changes or self._solver.name in ("start", MODEL, "sobol"):
-            self._before += [*evaluations, *by_hand]
-            values = [evaluation.values[0] for evaluation in evaluations if evaluation.counts]
-            self._spread = max(self._spread, max(values, default=0.0) - min(values, default=0.0))
-        best = best_of([*evaluations, self._stage_best])
-        progress = self._progress(self._stage_best, best)
-        self._without_progress = 0 if progress else self._without_progress + len(evaluations)
-        if progress:
-            self._stage_best = best
-        self._best = best_of([self._best, *evaluations, *by_hand])
+        news = [*evaluations, *by_hand]
+        self._known.update({evaluation.point: evaluation for evaluation in news})
+        self._places.update({evaluation.point: self.search.unit(evaluation.point) for evaluation in news})
+        for value in (evaluation.values[0] for evaluation in news if evaluation.counts):
+            self._lowest_value, self._highest_value = min(self._lowest_value, value), max(self._highest_value, value)
+        if evaluations:
+            arm = self._arm
+            arm.solver.tell([replace(e, point=self._reduced(arm, e.point)) for e in evaluations])
+            self._best = best_of([self._best, *evaluations])
+            self._follow(arm, evaluations)
+            arm.spent += len(evaluations)
+        self._best = best_of([self._best, *by_hand])
+        own = evaluations if evaluations and self._arm.solver.name == MODEL else ()
+        self._told_places += [self._places[evaluation.point] for evaluation in own]
+        self._untold += [evaluation for evaluation in news if evaluation not in own]
+
+    def _follow(self, arm: _Arm, evaluations: Sequence[Evaluation]) -> None:
+        """Note the progress of a method."""
+        for evaluation in evaluations:
+            best = best_of([arm.best, evaluation])
+            progress = self._progress(arm.best, best)
+            arm.without_progress = 0 if progress else arm.without_progress + 1
+            arm.best = best
+            if arm.start is not None and best is not None:
+                arm.path.append(self.search.unit(best.point))
 
     def _progress(self, before: Evaluation | None, after: Evaluation | None) -> bool:
         """Return whether the best has improved by more than `PROGRESS`."""
         if after is None or before is None:
             return after is not None
         (kind, cost), (kind_before, cost_before) = rank_key(after), rank_key(before)
-        return kind < kind_before or (kind == kind_before and cost < cost_before - PROGRESS * self._spread)
+        spread = max(self._highest_value - self._lowest_value, 0.0)
+        return kind < kind_before or (kind == kind_before and cost < cost_before - PROGRESS * spread)
 
     def close(self) -> None:
-        self._solver.close()
-
-
-def _between(parameter: Dimension, lower: float, upper: float) -> Parameter:
-    """Return the parameter with other ends; unchanged if they are equal, in a range of few floating-point numbers."""
-    assert isinstance(parameter, Parameter)
-    return replace(parameter, lower=lower, upper=upper) if lower < upper else parameter
+        for arm in self._arms:
+            arm.solver.close()

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Callable, Sequence, Set
+from functools import cache
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
+from scipy.spatial.distance import cdist
+from scipy.special import boxcox1p, log_ndtr, ndtri
 
 from vtbdrake.optimization.parameter import Choice
 from vtbdrake.optimization.solvers.designs import sobol_units
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError, rank_key
 
 if TYPE_CHECKING:
-    from sklearn.gaussian_process import GaussianProcessRegressor
+    from threadpoolctl import ThreadpoolController
 
 # Candidates of the acquisition over the whole space.
 SPREAD = 500
@@ -34,6 +37,12 @@ SIGNAL = (1.0, 1.0)
 LENGTH = (0.5, 1.0)
 # The noise.
 NOISE = (1e-4, 3.0)
+# Ranges of the hyperparameters.
+SIGNAL_RANGE = (0.05, 20.0)
+LENGTH_RANGE = (0.02, 20.0)
+NOISE_RANGE = (1e-7, 0.5)
+# What is added to the variances, so that the covariances can be factorized.
+JITTER = 1e-10
 # Draws of the posterior of several objectives.
 DRAWS = 64
 
@@ -86,10 +95,7 @@ class Bayesian(Solver):
         begun, self._begun = self._begun, True
         if not begun and len(self._evaluations) < self._initial:
             return self._design()
-        # The last digits of the linear algebra depend on the number of threads.
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1, user_api="blas"):
+        with _linear_algebra().limit(limits=1, user_api="blas"):
             points = self._proposals()
         if not points:
             self._end(True, "every point of the space is known")
@@ -136,13 +142,11 @@ class Bayesian(Solver):
         A mean is taken over the transformed values and transformed back: rather a median. It lies between the worst and
         the best value so far. Without any value it is NaN.
         """
-        from threadpoolctl import threadpool_limits
-
         remembered = self._remembered()
         usable = np.array([evaluation.usable for evaluation in remembered], dtype=bool)
         if not usable.any():
             return np.full((len(units), self.search.objectives), np.nan)
-        with threadpool_limits(1, user_api="blas"):
+        with _linear_algebra().limit(limits=1, user_api="blas"):
             _, _, targets = self._fit(remembered)
             places = self._encoded(self._snapped(units))
             columns = []
@@ -293,66 +297,98 @@ class Bayesian(Solver):
 # -- the model
 
 
+@cache
+def _linear_algebra() -> ThreadpoolController:
+    """Return what limits the threads of the linear algebra, on whose number the last digits depend."""
+    # Imported and made once: it looks through all libraries of the process.
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
 class _Model:
-    """A Gaussian process of one output, of mean 0."""
+    """A Gaussian process of one output, of mean 0: Matern 5/2 with a length scale per input, and noise."""
 
     def __init__(self) -> None:
-        self._process: GaussianProcessRegressor | None = None
+        # The logarithms of the hyperparameters: signal, length scales, noise.
+        self._theta: np.ndarray | None = None
         self._fitted = 0
+        self._X, self._y = np.empty((0, 0)), np.empty(0)
+        self._factor, self._alpha = np.empty((0, 0)), np.empty(0)
 
     def fit(self, X: np.ndarray, y: np.ndarray) -> None:
         """Fit the process to ``y``, shape (k,), at ``X``, shape (k, m); the kernel only if enough points are new."""
-        from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-
-        if self._process is None:
-            scales = np.full(X.shape[1], LENGTH[0] * X.shape[1] ** 0.25)
-            smooth = ConstantKernel(SIGNAL[0], (0.05, 20.0)) * Matern(scales, (0.02, 20.0), nu=2.5)
-            kernel = smooth + WhiteKernel(NOISE[0], (1e-7, 0.5))
-        else:
-            kernel = self._process.kernel_
-        news = abs(len(X) - self._fitted) > 0.05 * self._fitted or len(X) < 20
-        if news:
+        theta = self._theta
+        if theta is None:
+            theta = np.log([SIGNAL[0], *[LENGTH[0] * X.shape[1] ** 0.25] * X.shape[1], NOISE[0]])
+        if len(X) < 20 or abs(len(X) - self._fitted) > 0.05 * self._fitted:
             self._fitted = len(X)
-        self._set(kernel, X, y, optimizer=_most_probable if news else None)
+            theta = _most_probable(X, y, theta)
+        self._theta = theta
+        self._set(X, y)
 
-    def _set(self, kernel: Any, X: np.ndarray, y: np.ndarray, *, optimizer: Any) -> None:
-        from sklearn.gaussian_process import GaussianProcessRegressor
+    def _set(self, X: np.ndarray, y: np.ndarray) -> None:
+        assert self._theta is not None
+        self._X, self._y = X, y
+        K = self._kernel(X)
+        K[np.diag_indices_from(K)] += math.exp(self._theta[-1]) + JITTER
+        self._factor = cholesky(K, lower=True, check_finite=False)
+        self._alpha = cho_solve((self._factor, True), y, check_finite=False)
 
-        with warnings.catch_warnings():
-            # Hyperparameters may lie at their bounds.
-            warnings.filterwarnings("ignore", module="sklearn")
-            self._process = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=optimizer).fit(X, y)
+    def _kernel(self, X: np.ndarray) -> np.ndarray:
+        """Return the covariances of the signal at ``X``, shape (k, m), with the points of the fit: (k, points)."""
+        assert self._theta is not None
+        lengths = np.exp(self._theta[1:-1])
+        r = math.sqrt(5.0) * cdist(X / lengths, self._X / lengths)
+        return np.asarray(math.exp(self._theta[0]) * (1.0 + r + r * r / 3.0) * np.exp(-r))
 
     def believe(self, x: np.ndarray) -> None:
         """Take the prediction at ``x``, shape (1, m), as known."""
-        process = self._process
-        assert process is not None
-        X, y = np.vstack([process.X_train_, x]), np.append(process.y_train_, process.predict(x))
-        self._set(process.kernel_, X, y, optimizer=None)
+        y = np.append(self._y, self._kernel(x) @ self._alpha)
+        self._set(np.vstack([self._X, x]), y)
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation without the noise, both of shape (k,)."""
-        assert self._process is not None
-        mean, deviation = self._process.predict(X, return_std=True)
-        noise = self._process.kernel_.k2.noise_level
-        return mean, np.sqrt(np.maximum(deviation**2 - noise, 1e-12))
+        assert self._theta is not None
+        K = self._kernel(X)
+        known = solve_triangular(self._factor, K.T, lower=True, check_finite=False)
+        variance = math.exp(self._theta[0]) - np.einsum("ij,ij->j", known, known)
+        return K @ self._alpha, np.sqrt(np.maximum(variance, 1e-12))
 
 
-def _most_probable(objective: Any, start: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float]:
-    """Minimize the negative log posterior density of a kernel's hyperparameters, given as logarithms."""
+def _most_probable(X: np.ndarray, y: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the logarithms of a kernel's hyperparameters with the largest posterior density, from a start."""
     from scipy.optimize import minimize
 
-    lengths = len(start) - 2
+    count, lengths = X.shape
     centre = np.log([SIGNAL[0], *[LENGTH[0] * lengths**0.25] * lengths, NOISE[0]])
     width = np.array([SIGNAL[1], *[LENGTH[1]] * lengths, NOISE[1]])
+    squares = ((X[:, np.newaxis] - X) ** 2).reshape(count * count, lengths)
+    diagonal = np.diag_indices(count)
 
     def density(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = objective(theta, eval_gradient=True)
+        """Return the negative logarithm of the density, and its gradient."""
+        signal, scales, noise = math.exp(theta[0]), np.exp(-2.0 * theta[1:-1]), math.exp(theta[-1])
+        r = np.sqrt(5.0 * (squares @ scales)).reshape(count, count)
+        decay = signal * np.exp(-r)
+        K = decay * (1.0 + r + r * r / 3.0)
+        noisy = K.copy()
+        noisy[diagonal] += noise + JITTER
+        try:
+            factor = cholesky(noisy, lower=True, check_finite=False)
+        except LinAlgError:
+            return math.inf, np.zeros_like(theta)
+        inverse = cho_solve((factor, True), np.eye(count), check_finite=False)
+        alpha = inverse @ y
+        weights = inverse - np.outer(alpha, alpha)
+        slopes = (weights * decay * (1.0 + r)).ravel() @ squares * scales * (5.0 / 3.0)
+        gradient = 0.5 * np.array([np.vdot(weights, K), *slopes, noise * np.trace(weights)])
         z = (theta - centre) / width
-        return value + 0.5 * float(z @ z), gradient + z / width
+        value = 0.5 * float(y @ alpha) + float(np.log(factor[diagonal]).sum()) + 0.5 * float(z @ z)
+        return value, gradient + z / width
 
-    result = minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15})
-    return result.x, float(result.fun)
+    bounds = np.log([SIGNAL_RANGE, *[LENGTH_RANGE] * lengths, NOISE_RANGE])
+    return np.asarray(minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15}).x)
 
 
 def _expected_improvement(model: _Model, examined: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -382,13 +418,18 @@ def _domination(costs: np.ndarray) -> np.ndarray:
 
 def _normal(costs: np.ndarray) -> np.ndarray:
     """Transform costs, shape (k,), monotonically towards a standard normal distribution."""
-    from scipy.stats import yeojohnson
-
     deviation = costs.std()
     if not deviation > 1e-12 * np.abs(costs).max():
         return np.zeros_like(costs)
-    bent, _ = yeojohnson((costs - np.median(costs)) / deviation)
-    return np.asarray((bent - bent.mean()) / (bent.std() or 1.0))
+    x = (costs - np.median(costs)) / deviation
+    # The exponent is the most likely one on a grid, which is then refined.
+    exponents = np.linspace(-4.0, 6.0, 51)
+    for width in (0.2, 0.0):
+        bent = np.where(x >= 0.0, boxcox1p(x, exponents[:, np.newaxis]), -boxcox1p(-x, 2.0 - exponents[:, np.newaxis]))
+        likelihood = (exponents - 1.0) * (np.sign(x) @ np.log1p(np.abs(x))) - 0.5 * len(x) * np.log(bent.var(axis=1))
+        best = int(np.argmax(likelihood))
+        exponents = np.linspace(exponents[best] - width, exponents[best] + width, 41)
+    return np.asarray((bent[best] - bent[best].mean()) / (bent[best].std() or 1.0))
 
 
 def _scaled(violations: np.ndarray) -> np.ndarray:

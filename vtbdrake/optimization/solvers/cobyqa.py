@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
@@ -42,6 +44,7 @@ class Cobyqa(BlockingSolver):
         # Imported here because it is slow.
         from scipy.optimize import NonlinearConstraint, minimize
 
+        _run_side_by_side()
         constraint = NonlinearConstraint(self._callback(lambda u: self._at(u)[2]), -np.inf, 0.0)
         result = minimize(
             self._callback(lambda u: self._at(u)[1]),
@@ -56,3 +59,14 @@ class Cobyqa(BlockingSolver):
             },
         )
         return bool(result.success), str(result.message)
+
+
+def _run_side_by_side() -> None:
+    """Replace the lock that SciPy 1.17 holds during a whole search: a second one, in another thread, would never begin.
+
+    The algorithm shares no state between calls, and newer releases have no lock.
+    """
+    from scipy.optimize import _cobyqa_py
+
+    if hasattr(_cobyqa_py, "COBYQA_LOCK"):
+        _cobyqa_py.COBYQA_LOCK = nullcontext()
