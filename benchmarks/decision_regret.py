@@ -22,7 +22,7 @@ from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers import make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 
-METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "random")
+METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "COBYQA", "grid", "random")
 # Methods that take a second or more for a decision: only by name, and with fewer seeds.
 SLOW = ("auto", "bayesian", "COBYQA")
 SEEDS = 15

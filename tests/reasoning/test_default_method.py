@@ -24,7 +24,7 @@ PLAN = Trajectory("u.plan", 4, 1.0, lower=-1.0, upper=1.0)
         ([WORD], 2, "random"),
         ([WORD, X], 100, "CMA-ES"),
         ([WORD, PLAN], 100, "CMA-ES"),
-        ([X] * 4, 30, "COBYQA"),
+        ([X] * 4, 30, "auto"),
         ([X] * 5, 30, "MPPI"),
         ([X], None, "MPPI"),
         ([WORD], None, "random"),
@@ -53,7 +53,7 @@ def _reasoner(budget, **search):
 @pytest.mark.parametrize(
     ("budget", "search", "method"),
     [
-        (Budget(rollouts=20), {}, "COBYQA"),
+        (Budget(rollouts=20), {}, "auto"),
         (Budget(seconds=5.0), {}, "MPPI"),
         (Budget(rollouts=20, seconds=5.0), {}, "MPPI"),
         (Budget(rollouts=20), {"pruning": Pruning()}, "MPPI"),

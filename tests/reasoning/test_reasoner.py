@@ -35,6 +35,8 @@ def make(scenario=None, **changes):
         "sample_period": 0.5,
         "budget": Budget(rollouts=30),
         "executor": "serial",
+        # Fills every budget, in batches.
+        "method": "MPPI",
         **changes,
     }
     groups = {

@@ -9,7 +9,7 @@ from vtbdrake.optimization.solvers.designs import discrete_size
 from vtbdrake.reasoning.space import Element
 from vtbdrake.reasoning.trajectory import Trajectory
 
-# Up to this number of numbers, quadratic models need few candidates.
+# Up to this number of numbers, the quadratic models that ``auto`` begins with need few candidates.
 FEW = 4
 
 
@@ -18,7 +18,7 @@ def default_method(elements: Sequence[Element], *, candidates: int | None) -> st
 
     * words and whole numbers, with no more combinations than candidates: ``grid``, which tries all;
     * words beside numbers: ``CMA-ES``; words alone: ``random``;
-    * up to four continuous numbers in a budget of rollouts: ``COBYQA``, which tries one candidate at a time;
+    * up to four continuous numbers in a budget of rollouts: ``auto``, which tries one candidate at a time at first;
     * everything else: ``MPPI``, for trajectories at a receding horizon, and in a budget of wall time.
 
     Args:
@@ -34,5 +34,5 @@ def default_method(elements: Sequence[Element], *, candidates: int | None) -> st
         return "CMA-ES" if trajectories or any(isinstance(p, Parameter) for p in parameters) else "random"
     continuous = not trajectories and all(parameter.is_continuous for parameter in parameters)
     if continuous and candidates is not None and len(parameters) <= FEW:
-        return "COBYQA"
+        return "auto"
     return "MPPI"

@@ -52,7 +52,7 @@ class SearchConfig:
     Attributes:
         method: Name of a solver from `vtbdrake.optimization.solvers` (``MPPI``, ``CEM``, ``predictive-sampling``,
             ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`. By default it follows from the
-            kind of decision: ``grid`` for few choices, ``CMA-ES`` with words, ``COBYQA`` for up to four numbers in a
+            kind of decision: ``grid`` for few choices, ``CMA-ES`` with words, ``auto`` for up to four numbers in a
             budget of rollouts without pruning, and else ``MPPI``.
         options: Options of the method, which is named then.
         pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
