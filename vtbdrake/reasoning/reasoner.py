@@ -81,7 +81,7 @@ class SearchConfig:
         if not isinstance(self.options, Mapping):
             raise ValueError(f"options are given by name, such as {{'samples': 24}}, not as {self.options!r}")
         if self.options and self.method is None:
-            raise ValueError(f"options are those of a method, which method= names; {dict(self.options)!r} are of none")
+            raise ValueError(f"options belong to a method: name it by method=, beside options={dict(self.options)!r}")
 
 
 class Reasoner:

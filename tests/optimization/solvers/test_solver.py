@@ -105,7 +105,8 @@ def test_the_same_seed_asks_for_the_same_points(name):
     assert first == second
 
 
-@pytest.mark.parametrize("name", SEEDED)
+# The local search that "auto" begins with needs no seed.
+@pytest.mark.parametrize("name", [name for name in SEEDED if name != "auto"])
 def test_another_seed_asks_for_other_points(name):
     first, second = (drive(make_solver(name, ROSENBROCK.space, seed=seed), ROSENBROCK.cost, limit=1) for seed in (1, 2))
     assert not {told.point for told in first} & {told.point for told in second}
@@ -177,11 +178,13 @@ def test_it_learns_from_points_given_by_hand(name):
     space = SPHERE.space
     spread = [told.point for told in drive(make_solver("sobol", space, points=60), SPHERE.cost)]
     near = [(1.0 + 0.02 * i, -0.5 - 0.02 * i) for i in range(-5, 6)]
+    # After the first points, the local search of "auto" is near in any case.
+    limit = 5 if name == "auto" else 20
 
     def typical_cost(given):
         solver = make_solver(name, space, seed=4)
         solver.tell([evaluation(point, SPHERE.cost) for point in given])
-        return np.median([SPHERE.cost(told.point) for told in drive(solver, SPHERE.cost, limit=20)])
+        return np.median([SPHERE.cost(told.point) for told in drive(solver, SPHERE.cost, limit=limit)])
 
     assert typical_cost([*spread, *near]) < 0.3 * typical_cost([])
 

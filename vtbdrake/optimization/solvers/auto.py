@@ -154,7 +154,7 @@ class Auto(Solver):
         self._count = 0
         self._changes: list[tuple[int, str]] = []
         # All evaluations of one objective, by their points.
-        self._known: dict[Point, Evaluation] = {}
+        self._evaluations: dict[Point, Evaluation] = {}
         # Their places in the unit cube.
         self._places: dict[Point, np.ndarray] = {}
         # Those that the Gaussian process was not told of yet, and the places of those that it was told of.
@@ -194,12 +194,12 @@ class Auto(Solver):
         search = self.search
         discrete = not any(parameter.is_continuous for parameter in search.space)
         if search.objectives == 1 and discrete and discrete_size(search.space) <= (search.budget or EXHAUSTIVE):
-            return self._one("grid", Grid(replace(search, start=None), name="grid"))
+            return self._single("grid", Grid(replace(search, start=None), name="grid"))
         if search.objectives > 1 or any(isinstance(parameter, Choice) for parameter in search.space):
-            return self._one(MODEL, Bayesian(search, name=MODEL, batch=self._batch))
+            return self._single(MODEL, Bayesian(search, name=MODEL, batch=self._batch))
         return self._portfolio()
 
-    def _one(self, method: str, solver: Solver) -> Iterator[_Arm]:
+    def _single(self, method: str, solver: Solver) -> Iterator[_Arm]:
         self._alone = True
         self._arm = self._new_arm(method, solver)
         return self._to_the_end(self._arm)
@@ -220,8 +220,11 @@ class Auto(Solver):
             first = Listed(replace(search, start=None, budget=None), name="start", points=[search.start])
             yield self._new_arm("start", first)
         if self._has_local:
-            by_hand = self._best.point if self._best is not None and search.start is None else None
-            self._begin_local(by_hand or search.start or search.point(search.start_unit()), radius=FIRST_RADIUS)
+            if self._best is not None and search.start is None:
+                # The best of the points that were given by hand.
+                self._begin_local(self._best.point, radius=LOCAL_RADIUS)
+            else:
+                self._begin_local(search.start or search.point(search.start_unit()), radius=FIRST_RADIUS)
             while self._local is not None and not self._is_located(self._local):
                 yield self._local
                 self._look_at_local()
@@ -291,7 +294,7 @@ class Auto(Solver):
             u[varied] += HOP * np.random.default_rng([self.search.seed, self._local_count]).normal(size=len(varied))
             beside = self.search.point(np.clip(u, 0.0, 1.0))
             return tuple(beside[i] if i in varied else value for i, value in enumerate(best.point))
-        evaluations = [evaluation for evaluation in self._known.values() if evaluation.counts]
+        evaluations = [evaluation for evaluation in self._evaluations.values() if evaluation.counts]
         places = np.array([self._places[evaluation.point] for evaluation in evaluations])
         free = np.ones(len(evaluations), dtype=bool)
         for basin in self._basins:
@@ -392,7 +395,7 @@ class Auto(Solver):
             if arm is None:
                 break
             self._arm = arm
-            points = self._asked(arm)
+            points = self._proposals(arm)
             if points:
                 if not self._changes or self._changes[-1][1] != arm.method:
                     self._changes.append((self._count, arm.method))
@@ -402,19 +405,19 @@ class Auto(Solver):
             arm.solver.close()
         return []
 
-    def _asked(self, arm: _Arm) -> list[Point]:
+    def _proposals(self, arm: _Arm) -> list[Point]:
         """Return the next points of a method; what is known already, it is told at once."""
         if arm.without_progress > arm.patience or arm.spent >= arm.limit:
             return []
         if arm.solver.name == MODEL and not self._alone:
             self._tell_model(arm.solver)
-        while asked := arm.solver.ask():
-            points = [self._completed(arm, point) for point in asked]
-            known = [self._known[point] for point in points if point in self._known]
-            if self._alone or len(known) < len(points):
+        while proposed := arm.solver.ask():
+            points = [self._completed(arm, point) for point in proposed]
+            repeated = [self._evaluations[point] for point in points if point in self._evaluations]
+            if self._alone or len(repeated) < len(points):
                 return points
-            arm.solver.tell([replace(e, point=point) for e, point in zip(known, asked, strict=True)])
-            self._follow(arm, known)
+            arm.solver.tell([replace(e, point=point) for e, point in zip(repeated, proposed, strict=True)])
+            self._follow(arm, repeated)
         return []
 
     def _tell_model(self, model: Solver) -> None:
@@ -444,7 +447,7 @@ class Auto(Solver):
             self._arm.solver.tell([*evaluations, *by_hand])
             return
         news = [*evaluations, *by_hand]
-        self._known.update({evaluation.point: evaluation for evaluation in news})
+        self._evaluations.update({evaluation.point: evaluation for evaluation in news})
         self._places.update({evaluation.point: self.search.unit(evaluation.point) for evaluation in news})
         for value in (evaluation.values[0] for evaluation in news if evaluation.counts):
             self._lowest_value, self._highest_value = min(self._lowest_value, value), max(self._highest_value, value)
@@ -455,9 +458,9 @@ class Auto(Solver):
             self._follow(arm, evaluations)
             arm.spent += len(evaluations)
         self._best = best_of([self._best, *by_hand])
-        own = evaluations if evaluations and self._arm.solver.name == MODEL else ()
-        self._told_places += [self._places[evaluation.point] for evaluation in own]
-        self._untold += [evaluation for evaluation in news if evaluation not in own]
+        of_model = evaluations if evaluations and self._arm.solver.name == MODEL else ()
+        self._told_places += [self._places[evaluation.point] for evaluation in of_model]
+        self._untold += [evaluation for evaluation in news if evaluation not in of_model]
 
     def _follow(self, arm: _Arm, evaluations: Sequence[Evaluation]) -> None:
         """Note the progress of a method."""

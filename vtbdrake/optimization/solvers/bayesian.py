@@ -299,7 +299,7 @@ class Bayesian(Solver):
 
 @cache
 def _linear_algebra() -> ThreadpoolController:
-    """Return what limits the threads of the linear algebra, on whose number the last digits depend."""
+    """Return a controller of the threads of the linear algebra: the last digits depend on their number."""
     # Imported and made once: it looks through all libraries of the process.
     from threadpoolctl import ThreadpoolController
 
@@ -351,8 +351,8 @@ class _Model:
         """Return mean and standard deviation without the noise, both of shape (k,)."""
         assert self._theta is not None
         K = self._kernel(X)
-        known = solve_triangular(self._factor, K.T, lower=True, check_finite=False)
-        variance = math.exp(self._theta[0]) - np.einsum("ij,ij->j", known, known)
+        projected = solve_triangular(self._factor, K.T, lower=True, check_finite=False)
+        variance = math.exp(self._theta[0]) - np.einsum("ij,ij->j", projected, projected)
         return K @ self._alpha, np.sqrt(np.maximum(variance, 1e-12))
 
 
