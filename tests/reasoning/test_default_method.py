@@ -75,7 +75,5 @@ def test_one_number_is_decided_better_than_by_sampling():
 
 
 def test_options_of_no_method_are_refused():
-    with pytest.raises(
-        ValueError, match="options belong to a method: name it by method=, beside options={'pop"
-    ):
+    with pytest.raises(ValueError, match="options belong to a method: name it by method=, beside options={'pop"):
         SearchConfig(options={"population": 8})
