@@ -255,7 +255,7 @@ def _methods(solver):
         pytest.param(
             2,
             200,
-            ["COBYQA from the start", "bayesian", "COBYQA in another basin", "CMA-ES, start 1, population 6"],
+            ["COBYQA from the start", "bayesian", "CMA-ES, start 1, population 6", "COBYQA in another basin"],
             marks=pytest.mark.slow,
         ),
     ],
@@ -410,7 +410,7 @@ def test_auto_evaluates_the_given_start_first():
 
 @pytest.mark.slow
 @pytest.mark.one_python
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_auto_leaves_a_well_that_is_not_the_deepest(seed):
     """Shekel's function: ten narrow wells; the second one is half as deep as the first."""
     wells = np.array([[4.0, 4], [1, 1], [8, 8], [6, 6], [3, 7], [2, 9], [5, 3], [8, 1], [6, 2], [7, 3.6]])[
