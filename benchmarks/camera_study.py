@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.measure import HIGHER, Benchmark, interleaved_values, spread
 from vtbdrake.rollout import RolloutResult, RolloutRunner
-from vtbdrake_diagrams.satellite.studies.mount import BY_HAND, entries, mount_problem
+from vtbdrake_diagrams.satellite.studies.mount import BY_HAND, FOUND_ON, mount_problem
 
 CANDIDATES = 50
 
@@ -25,9 +25,9 @@ def camera_study_speedup(repeats: int = 2) -> Benchmark:
     Raises:
         AssertionError: The results differ in any bit.
     """
-    along, whole = (mount_problem(seeds=(0,), recorded=recorded) for recorded in (True, False))
+    along, whole = (mount_problem(on=FOUND_ON[:1], recorded=recorded) for recorded in (True, False))
     runners = [RolloutRunner(problem.task, along.testbed) for problem in (along, whole)]
-    points = [along.values(entries(pose), condition=0) for pose in BY_HAND.values()]
+    points = [along.values(pose.tolist(), condition=0) for pose in BY_HAND.values()]
     results: list[list[RolloutResult]] = [[], []]
 
     def measure(which: int) -> float:

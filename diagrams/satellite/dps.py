@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import (
     ConstantValueSource,
@@ -47,6 +47,7 @@ class TargetSensors:
         aboard: Those of ``camera`` and ``scanner`` whose data are evaluated, whether the tracker follows them or not.
         config: How images and scans are evaluated.
         image: Size of the images and intrinsics of the camera, if it is aboard.
+        X_BC: Pose of the camera on the base.
         image_latency: How old the images are when they are shown, in s.
         pose_latency: How old the poses of the pose sensor are when they are shown, in s.
     """
@@ -55,6 +56,7 @@ class TargetSensors:
     aboard: tuple[str, ...]
     config: PerceptionConfig
     image: CameraInfo | None
+    X_BC: RigidTransform
     image_latency: float
     pose_latency: float
 
@@ -119,6 +121,7 @@ def _make_env(sensing: TargetSensors, *, period: float) -> Diagram:
             config=sensing.config,
             period=period,
             info=sensing.image,
+            X_BC=sensing.X_BC,
             image_latency=sensing.image_latency,
         )
         sources["camera"] = markers.GetOutputPort("estimate")

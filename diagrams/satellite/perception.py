@@ -271,6 +271,7 @@ def add_marker_part(
     config: PerceptionConfig,
     period: float,
     info: CameraInfo,
+    X_BC: RigidTransform,
     image_latency: float = 0.0,
 ) -> SlowPart:
     """Add the slow part ``markers`` with its ``image_arrival``, and the input port ``image`` of their Diagram.
@@ -282,6 +283,7 @@ def add_marker_part(
         config: The configuration of the evaluation of images.
         period: The period of the DPS, in s.
         info: The size of its images, and its intrinsics.
+        X_BC: Pose of the camera on the base.
         image_latency: How old its images are when it shows them, in s.
 
     Returns:
@@ -291,7 +293,7 @@ def add_marker_part(
 
     function = MarkerPose(
         board=target_board(),
-        X_BC=Servicer().X_BC,
+        X_BC=X_BC,
         intrinsics=np.array([info.focal_x(), info.focal_y(), info.center_x(), info.center_y()]),
         detector=config.detector,
         period=period,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from drake import lcmt_scope
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
@@ -24,7 +25,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.lcm.sensor_messages import image_map, scan_map
-from vtbdrake.state.systems import pose_later, pose_to_array
+from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, TargetSensors, make_dps
@@ -81,6 +82,9 @@ class SatelliteScenario(Scenario):
     image_height: int = setting(240, "Height of these images.", unit="pixels", gt=0)
     fov_y: float = setting(0.9, "Field of view of the camera from top to bottom.", unit="rad", gt=0.0, lt=np.pi)
     camera_fps: float = setting(5.0, "Images per second.", unit="Hz", gt=0.0, le=0.5 / PERIOD)
+    # Where the camera sits on the base, for the world and for the DPS: [x, y, z, roll, pitch, yaw] of C in B, in m and
+    # rad; empty: the nominal place.
+    camera_pose: list[float] = field(default_factory=list)
     # Errors of the images, in counts.
     camera_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1.0))
     # The laser scanner, and the errors of its ranges in m.
@@ -108,6 +112,17 @@ class SatelliteScenario(Scenario):
             self.light.check("SatelliteScenario.light")
         except ValueError as error:
             raise ScenarioError(str(error)) from None
+
+        if len(self.camera_pose) not in (0, 6) or not np.isfinite(self.camera_pose).all():
+            raise ScenarioError(
+                "SatelliteScenario.camera_pose must be [x, y, z, roll, pitch, yaw] in m and rad, or empty for the "
+                f"nominal pose, not {self.camera_pose!r}"
+            )
+
+    @property
+    def X_BC(self) -> RigidTransform:
+        """Pose of the docking camera on the base."""
+        return pose_from_array(np.array(self.camera_pose)) if self.camera_pose else Servicer().X_BC
 
     @property
     def aboard(self) -> tuple[str, ...]:
@@ -176,6 +191,7 @@ class SatelliteScenario(Scenario):
             aboard=self.aboard,
             config=self.evaluation,
             image=self.camera_info if "camera" in self.aboard else None,
+            X_BC=self.X_BC,
             image_latency=self.camera_errors.latency / self.camera_fps,
             pose_latency=self.pose_errors.latency * POSE_PERIOD,
         )
@@ -275,9 +291,13 @@ class SatelliteScenario(Scenario):
         plant, scene_graph = builder.plant, builder.scene_graph
         if "camera" in self.aboard:
             light = builder.add("env", "light", Light(self.light))
+            frame, X_FC = plant.GetFrameByName("camera"), None
+            if self.camera_pose:
+                frame, X_FC = frame.body().body_frame(), self.X_BC
             camera = Camera(
                 plant,
-                plant.GetFrameByName("camera"),
+                frame,
+                X_FC=X_FC,
                 period=1.0 / self.camera_fps,
                 info=self.camera_info,
                 supersampling=2,

@@ -72,6 +72,21 @@ def test_a_motion_is_recorded_once_for_all_tasks():
     assert sight.measured - recorded > 120
 
 
+def test_followers_may_have_other_parameters_while_the_motion_is_recorded():
+    task = along(make(horizon=3.0))
+    spared = replace(task, motion=replace(task.motion, while_recording={"sim.sense.sight.noise": 9.0}))
+    point = {PLACE: [1.0, 0.5, 1.0], **START}
+    first = RolloutRunner(task)
+    assert RolloutRunner(spared, first.testbed).run(point).identical(first.run(point))
+
+
+def test_what_the_motion_depends_on_has_no_other_value_while_it_is_recorded():
+    task = along(make(horizon=3.0))
+    motion = replace(task.motion, while_recording={"sim.sys.Acrobot.shoulder.damping": 1.0})
+    with pytest.raises(MotionError, match="shoulder.damping is no parameter of a follower"):
+        RolloutRunner(replace(task, motion=motion))
+
+
 def test_samples_closer_than_the_memory_are_simulated_as_a_whole():
     task = make(horizon=1.0, sample_period=0.05)
     point = {PLACE: [0.3, 0.0, 0.0], **START}

@@ -52,6 +52,8 @@ class RecordedMotion:
             result. The memory of a filter is infinite: f must use its input.
         varied: Addresses of the varied variables, which are parameters of followers; a `Problem` sets them to its
             parameters' addresses.
+        while_recording: Values of parameters of followers while the motion is recorded, by address: for example an
+            exposure of 0, with which a camera renders nothing.
 
     Raises:
         ValueError: The memory is not a positive time.
@@ -59,6 +61,7 @@ class RecordedMotion:
 
     memory: float
     varied: Sequence[str] = ()
+    while_recording: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "memory", as_number("the memory of a recorded motion", self.memory))
@@ -106,6 +109,9 @@ class MotionPlayer:
             )
         self._paths = tuple(path for path, _ in leaves(testbed.diagram))
         self._following = following = self._followers()
+        for address in motion.while_recording:
+            if address in self.fixed({address: None}):
+                raise MotionError(f"{address} is no parameter of a follower: the recorded motion could depend on it")
         self._state_layout = StateLayout(
             testbed.diagram, state=lambda path: path != BOARD, parameters=lambda path: False
         )
@@ -176,7 +182,8 @@ class MotionPlayer:
             instants: The simulator's time at each sample, shape (n,).
         """
         of_testbed = _RECORDINGS.setdefault(self._testbed, {})
-        return of_testbed.setdefault((self.motion.memory, tuple(self._following), instants.tobytes()), {})
+        recorded_with = tuple((key, np.asarray(value).tobytes()) for key, value in self.motion.while_recording.items())
+        return of_testbed.setdefault((self.motion.memory, tuple(self._following), recorded_with, instants.tobytes()), {})
 
     def state(self, context: Context) -> FlatState:
         """Return the state from which a window begins."""

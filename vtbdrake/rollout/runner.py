@@ -305,7 +305,7 @@ class RolloutRunner:
         self._timed = True
 
     def _recording(self, parameters: Mapping[str, Any], raise_if_cancelled: Callable[[], None]) -> Recording:
-        """Return the recorded motion, in which the parameters of the followers are as in s0; record it if necessary.
+        """Return the recorded motion; record it if necessary, with the followers' parameters as in s0, or as declared.
 
         From default starts a motion is recorded once for all tasks on this testbed with the same samples. If it fails
         or ends early, the rollouts along it are simulated from there on, and do the same.
@@ -317,7 +317,7 @@ class RolloutRunner:
         if key not in self._recordings:
             recording = Recording()
             with suppress(SimulationError):
-                self._reset(fixed)
+                self._reset({**fixed, **self._player.motion.while_recording})
                 for t, instant, window in zip(self._times, self._instants, self._windows, strict=True):
                     raise_if_cancelled()
                     if window is not None and _terminated(self._advance(window, window)):

@@ -1,26 +1,33 @@
 """Application O1: where should the docking camera sit to see as many markers as possible during the capture?
 
 The capture is led by a pose sensor, and the camera looks on: so the motion does not depend on the camera, and is
-recorded once for every capture (`vtbdrake.RecordedMotion`). The camera sits on the front face of the base, on which the
-arm stands, too. Its position on the face and the direction of its view are decided.
+recorded once for every capture (`vtbdrake.RecordedMotion`). The camera sits at the front face of the base, on which the
+arm stands, too. All six numbers of its pose are decided.
 
 The choices that influence the answer were fixed before the first placement was judged:
 
-* the placements by hand, `BY_HAND`: above the arm, on either side, in a corner, and beside the foot of the arm, all but
-  the first aimed at the place where the bar is gripped;
-* the captures, `SEEDS`: the first start poses of the scenario, which all succeed;
+* the captures: placements are found on `FOUND_ON`, and judged on `JUDGED_ON`, each at five tumble rates;
+* the placements by hand: the places `PLACES`, each aimed by the rules `RULES`, of which one knows how the base reacts
+  to the arm. The best of each rule on `FOUND_ON` is judged beside the placement found;
 * the time that counts: from the start until the base and the target rest against each other, `HORIZON`;
 * the light: the scenario's own;
-* the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths.
+* the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths;
+* the search: the best of each rule, `GLOBAL` placements by the default solver, then `LOCAL` by NLopt's COBYLA
+  in Drake's MathematicalProgram, from the best so far.
 
-``python -m vtbdrake_diagrams.satellite.studies.mount [--full]`` prints the answer and draws it. The DPS keeps the
-nominal pose of the camera: the markers that it detects in an image do not depend on it.
+Beside the count of markers, every image gives a pose of the target, or none: how far that pose has the bar off is
+judged, too. At last the placements judged guide captures themselves, without wheels.
+
+``python -m vtbdrake_diagrams.satellite.studies.mount --full`` does what is missing in ``mount.json`` beside this
+module, keeps it step by step and draws the answer; without ``--full`` the results are read. The row of the answers
+reads them, and judges a few captures anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import click
@@ -28,20 +35,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import ArrayLike
+from scipy.stats import t as student
 
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
-from vtbdrake.optimization import Sweep
-from vtbdrake.rollout import Executor, ProcessExecutor, RolloutResult, RolloutRunner
+from vtbdrake.components.perception.markers import detect_markers, pose_from_markers
+from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.state import NamedVector, Quantity
-from vtbdrake.state.systems import pose_to_array
+from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake.visualization.study_plots import BEST
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.kept_results import read_results, write_results
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
+from vtbdrake_diagrams.satellite.perception import target_board
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
+from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, RECORDED, bar_error, time_to_grip
 
 POSE = "sim.sense.docking_camera.pose"
 _ENTRIES = NamedVector(
@@ -54,25 +64,75 @@ _ENTRIES = NamedVector(
 )
 IMAGE = "sim.sense.docking_camera.color_image"
 COUNT = "dps.env.markers.count"
+_EXPOSURE = "sim.sense.docking_camera.exposure"
+_BODIES = ("sim.sys.servicer.base", "sim.sys.target.body")
+_MOTION = tuple(f"{body}.{value}" for body in _BODIES for value in ("pose", "velocity"))
 
 HORIZON = 24.0
 """How long the markers count, in s: from the start until the relative motion has stopped."""
-SAMPLE_PERIOD = 2.0
+SAMPLE_PERIOD = 4.0
 """How often they are counted, in s."""
-SEEDS = tuple(range(8))
-"""The start poses over which the count is averaged; the short version takes the first `FEW`."""
-FEW = 3
+TUMBLES = (0.5, 1.0, 1.5, 2.0, 3.0)
+"""The tumble rates of the captures, in deg/s: up to the one at which captures must succeed."""
 TELLING = 0.3
 """The least difference of mean counts that means anything, in markers."""
+GLOBAL = 10
+"""How many placements the default solver tries, beside those by hand."""
+LOCAL = 14
+"""How many COBYLA tries after them."""
+GUIDED = 5
+"""How many of `JUDGED_ON` the cameras guide."""
+GUIDED_HORIZON = 36.0
+"""How long a capture that the camera guides may take, in s."""
+GUIDED_RATE = 2.5
+"""The images per second of a camera that guides, in Hz: less than usual, because images are what a capture costs."""
+RERUN = 2
+"""How many captures the row judges anew."""
+RESULTS = Path(__file__).with_suffix(".json")
+"""The results that ``--full`` keeps."""
+COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --full"
 
-# Place of the camera along x of B, in m: 2 cm before the front face.
+# The least place of the camera along x of B, in m: 2 cm before the front face; a bracket reaches 10 cm farther.
 _X = 0.62
+_BRACKET = 0.1
 # Largest distance from the middle of the face at which the camera's housing fits on it, in m.
 _REACH = 0.45
-# How far the view may turn away from straight ahead, in rad.
-_TURN = 0.5
+# How far the view may turn away from straight ahead, and about its axis, in rad.
+_TURN = 0.8
+_TWIST = 1.2
 # How far the camera stays away from the axis of the arm's foot, in m.
 _FOOT = 0.18
+# How far the base turns down while the arm reaches out, in rad: 17 to 20 deg.
+_REACTION = 0.33
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture: its start and its tumble rate.
+
+    Attributes:
+        seed: The seed of the start.
+        tumble_deg: The tumble rate in deg/s.
+    """
+
+    seed: int
+    tumble_deg: float = SatelliteScenario.tumble_deg
+
+    def values(self) -> dict[str, Any]:
+        """Return the values that make a rollout start as in a scenario with this seed and rate."""
+        start = random_start(self.seed, tumble=np.radians(self.tumble_deg), distance=SatelliteScenario.distance)
+        return start.values()
+
+
+def captures(first: int, count: int) -> tuple[Capture, ...]:
+    """Return captures with the seeds from ``first`` on, at all rates of `TUMBLES` in turn."""
+    return tuple(Capture(first + k, TUMBLES[k % len(TUMBLES)]) for k in range(count))
+
+
+FOUND_ON = captures(0, 5)
+"""The captures on which placements are found."""
+JUDGED_ON = captures(100, 20)
+"""The captures on which they are judged."""
 
 
 def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
@@ -87,35 +147,44 @@ def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
     return _ENTRIES.array(x=_X, y=y, z=z, roll=-np.pi / 2 - tilt, yaw=-np.pi / 2 + pan)
 
 
-def aimed(y: float, z: float) -> Array:
-    """Return the pose of a camera on the front face that looks at the place where the bar is gripped."""
-    p_BH = np.array([SatelliteScenario().distance, 0.0, 0.0]) + Target().X_TH.translation()
-    ahead, left, up = p_BH - [_X, y, z]
+def aimed(y: float, z: float, p_BQ: Array | None = None) -> Array:
+    """Return the pose of a camera on the front face that looks at a point.
+
+    Args:
+        y: Place of the camera to the left, in m.
+        z: Its place up, in m.
+        p_BQ: The point in B, in m; by default the place where the bar is gripped, as if the base stood still.
+    """
+    if p_BQ is None:
+        p_BQ = np.array([SatelliteScenario.distance, 0.0, 0.0]) + Target().X_TH.translation()
+    ahead, left, up = p_BQ - [_X, y, z]
     return pose(y, z, tilt=float(np.arctan2(-up, np.hypot(ahead, left))), pan=float(np.arctan2(left, ahead)))
 
 
-BY_HAND: dict[str, Array] = {
-    "above the arm": pose_to_array(Servicer().X_BC),
-    "on the left": aimed(0.4, 0.0),
-    "on the right": aimed(-0.4, 0.0),
-    "in the upper left corner": aimed(0.4, 0.4),
-    "beside the foot of the arm": aimed(0.25, -0.35),
+PLACES: dict[str, tuple[float, float]] = {
+    "above the arm": Servicer().camera_position[1:],
+    "on the left": (0.4, 0.0),
+    "on the right": (-0.4, 0.0),
+    "in the upper left corner": (0.4, 0.4),
+    "beside the foot of the arm": (0.25, -0.35),
 }
-"""The placements by hand."""
+"""The places by hand: y and z in B, in m."""
 
-# How far the base turns down while the arm reaches out, in rad: 17 to 20 deg in the first three captures.
-_REACTION = 0.33
+BY_HAND: dict[str, Array] = {
+    name: pose_to_array(Servicer().X_BC) if name == "above the arm" else aimed(*place) for name, place in PLACES.items()
+}
+"""The placements by hand as if the base stood still."""
+
+STILL = "as if the base stood still"
+TURNED = "turned up by the turn of the base"
+RULES = (STILL, TURNED)
+"""How placements by hand are aimed. `TURNED` knows how the base reacts to the arm."""
 
 
-def _turned_up(value: Array) -> Array:
-    higher = np.array(value)
-    entries = _ENTRIES.view(higher)
-    entries.roll = min(entries.roll + _REACTION, -np.pi / 2 + _TURN)
-    return higher
-
-
-AFTERWARDS: dict[str, Array] = {f"{name}, turned up": _turned_up(value) for name, value in BY_HAND.items()}
-"""The same, turned up by as much as the base turns down: thought of after the first answer, which showed why."""
+def by_hand(rule: str) -> dict[str, Array]:
+    """Return the placements by hand that a rule of `RULES` aims."""
+    turn = _REACTION if rule == TURNED else 0.0
+    return {name: value + _ENTRIES.array(roll=turn) for name, value in BY_HAND.items()}
 
 
 def _address(name: str) -> str:
@@ -124,9 +193,11 @@ def _address(name: str) -> str:
 
 
 PARAMETERS = (
+    vtb.Parameter(_address("x"), _X, _X + _BRACKET),
     vtb.Parameter(_address("y"), -_REACH, _REACH),
     vtb.Parameter(_address("z"), -_REACH, _REACH),
     vtb.Parameter(_address("roll"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
+    vtb.Parameter(_address("pitch"), -_TWIST, _TWIST),
     vtb.Parameter(_address("yaw"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
 )
 
@@ -148,16 +219,10 @@ def scenario() -> SatelliteScenario:
     return SatelliteScenario(perception="pose_sensor", onlookers="camera")
 
 
-def capture(seed: int) -> dict[str, Any]:
-    """Return the values that make the capture start as in a scenario with this seed."""
-    defaults = scenario()
-    return random_start(seed, tumble=np.radians(defaults.tumble_deg), distance=defaults.distance).values()
-
-
 def mount_problem(
     parameters: Sequence[vtb.Parameter] = PARAMETERS,
     *,
-    seeds: Sequence[int] = SEEDS,
+    on: Sequence[Capture] = FOUND_ON,
     reading: str = "integral",
     fixed: Mapping[str, float] | None = None,
     recorded: bool = True,
@@ -166,7 +231,7 @@ def mount_problem(
 
     Args:
         parameters: Entries of the camera's pose.
-        seeds: The seeds of the captures over which the quality is averaged.
+        on: The captures over which the quality is averaged.
         reading: The quality of the number of markers over time: ``integral``, in markers times s, or ``best``, the
             paper's maximum.
         fixed: Values of other entries of the pose, by address.
@@ -182,47 +247,187 @@ def mount_problem(
         quality=vtb.Quality(markers_seen, of=COUNT, reading=reading, upper=upper),
         horizon=HORIZON,
         sample_period=SAMPLE_PERIOD,
-        conditions=[{**capture(seed), **(fixed or {})} for seed in seeds],
+        conditions=[{**capture.values(), **(fixed or {})} for capture in on],
         risk="mean",
         constraints=[vtb.Constraint(distance_from_foot, of=POSE, at_least=_FOOT)],
-        motion=vtb.RecordedMotion(memory) if recorded else None,
+        motion=vtb.RecordedMotion(memory, while_recording={_EXPOSURE: 0.0}) if recorded else None,
     )
 
 
-def entries(value: ArrayLike) -> tuple[float, ...]:
-    """Return the values of `PARAMETERS` in a pose, shape (6,)."""
-    camera = _ENTRIES.view(np.asarray(value))
-    return camera.y, camera.z, camera.roll, camera.yaw
-
-
-def mean_count(rollout: RolloutResult) -> float:
-    """Return the mean number of markers over the capture."""
-    return float(np.trapezoid(rollout.quality, rollout.times)) / HORIZON if not rollout.failed else float("nan")
+# -- looking on
 
 
 @dataclass(frozen=True)
-class Placement:
-    """A placement of the camera, and its result in each capture.
+class Look:
+    """What a camera sees in some captures.
 
     Attributes:
-        name: Its name.
-        pose: The pose [x, y, z, roll, pitch, yaw] in B, (6,), in m and rad.
-        rollouts: The rollouts, one per capture.
+        counts: The markers at the sample times after the start, shape (captures, samples).
+        errors: How far the pose from an image's markers has the bar off, in m, likewise; NaN where there is no pose.
     """
 
-    name: str
-    pose: Array
-    rollouts: tuple[RolloutResult, ...]
+    counts: Array
+    errors: Array
+
+    @property
+    def means(self) -> Array:
+        """Return the mean number of markers over each capture, by the trapezoidal rule, shape (captures,)."""
+        from_start = np.concatenate([np.zeros_like(self.counts[:, :1]), self.counts], axis=1)
+        means: Array = np.trapezoid(from_start, dx=SAMPLE_PERIOD, axis=1) / HORIZON
+        return means
 
     @property
     def mean(self) -> float:
-        """Return the mean number of markers over all captures."""
-        return _mean_at(self.rollouts)
+        """Return the mean number of markers."""
+        return float(self.means.mean())
 
     @property
     def most(self) -> float:
         """Return the mean over the captures of the maximum over time, the paper's quality."""
-        return _most_at(self.rollouts)
+        return float(self.counts.max(axis=1).mean())
+
+    @property
+    def posed(self) -> float:
+        """Return the share of the images that give a pose."""
+        return float(np.isfinite(self.errors).mean())
+
+    @property
+    def accuracy(self) -> float:
+        """Return the median error of the bar over the images that give a pose, in m; NaN if none does."""
+        return float(np.nanmedian(self.errors)) if self.posed else float("nan")
+
+    @staticmethod
+    def of(kept: Mapping[str, Any]) -> Look:
+        """Return what was kept."""
+        return Look(np.array(kept["counts"], dtype=float), np.array(kept["errors"], dtype=float))
+
+
+class Onlooker:
+    """Judges placements along recorded captures, one capture and placement at a time.
+
+    Args:
+        on: The captures.
+    """
+
+    def __init__(self, on: Sequence[Capture]) -> None:
+        self.problem = mount_problem(on=on)
+        self._count = len(on)
+        task = replace(self.problem.task, record=(IMAGE, *_MOTION), catch=False)
+        self._runner = RolloutRunner(task, self.problem.testbed)
+        info = self.problem.scenario.camera_info  # type: ignore[attr-defined]
+        self._intrinsics = np.array([info.focal_x(), info.focal_y(), info.center_x(), info.center_y()])
+        self._board = target_board()
+
+    def rollout(self, value: Array, capture: int = 0) -> RolloutResult:
+        """Return the rollout with a placement in a capture, with its images and the motion."""
+        rollout = self._runner.run(self.problem.values(value.tolist(), condition=capture))
+        if rollout.failed:
+            raise ValueError(f"the camera at {value.tolist()} cannot be judged: {rollout.message}")
+        return rollout
+
+    def look(self, value: Array) -> Look:
+        """Return what a camera with this pose sees in all captures."""
+        rollouts = [self.rollout(value, k) for k in range(self._count)]
+        return Look(
+            np.array([rollout.quality[1:] for rollout in rollouts]),
+            np.array([self._errors(rollout, value) for rollout in rollouts]),
+        )
+
+    def _errors(self, rollout: RolloutResult, value: Array) -> list[float]:
+        """Return the error of the bar by each image after the start, in m."""
+        X_BC, p_THo = pose_from_array(value), Target().X_TH.translation()
+        age = -1.0 / self.problem.scenario.camera_fps  # type: ignore[attr-defined]
+        errors = []
+        for k in range(1, len(rollout.times)):
+            X_WB, X_WT = (
+                pose_from_array(pose_later(*(rollout.record[f"{body}.{v}"][k] for v in ("pose", "velocity")), age))
+                for body in _BODIES
+            )
+            X_CT = (X_WB @ X_BC).InvertAndCompose(X_WT)
+            detections = detect_markers(rollout.record[IMAGE][k]).on(self._board)
+            # The tracker's prediction, which decides between two poses of markers in a plane, is near the truth.
+            estimate = pose_from_markers(detections, self._board, self._intrinsics, time=0.0, prediction=X_CT)
+            errors.append(float(np.linalg.norm(estimate.X @ p_THo - X_CT @ p_THo)) if estimate.valid else np.nan)
+        return errors
+
+
+# -- guiding
+
+
+@dataclass(frozen=True)
+class Guided:
+    """The captures that a camera has guided.
+
+    Attributes:
+        times: When the fingers held the bar, in s, `FAILURE` if they never did, shape (captures,).
+        errors: How far the bar was from where the DPS believed it then, in m; NaN without success.
+    """
+
+    times: Array
+    errors: Array
+
+    @property
+    def successes(self) -> int:
+        """Return how many captures succeeded."""
+        return int((self.times < FAILURE).sum())
+
+
+def guide(value: Array, on: Sequence[Capture]) -> Guided:
+    """Simulate captures that a camera with this pose guides, alone and without wheels."""
+    guided = SatelliteScenario(perception="camera", camera_fps=GUIDED_RATE, camera_pose=value.tolist())
+    task = RolloutTask(
+        scenario=guided,
+        horizon=GUIDED_HORIZON,
+        quality=vtb.Quality(time_to_grip, of=["dps.impl.supervisor.mode", "dps.env.base.time"], minimize=True),
+        threshold=FAILURE,
+        sample_period=0.2,
+        record=RECORDED,
+    )
+    runner = RolloutRunner(task, guided.build())
+    rollouts = [runner.run(capture.values()) for capture in on]
+    times = [FAILURE if rollout.failed else rollout.value for rollout in rollouts]
+    errors = [bar_error(r.record) if t < FAILURE else np.nan for r, t in zip(rollouts, times, strict=True)]
+    return Guided(np.array(times), np.array(errors))
+
+
+# -- the campaign
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A placement of the camera, and its results.
+
+    Attributes:
+        name: Its name.
+        rule: How it is aimed: one of `RULES`, or ``search``.
+        pose: The pose [x, y, z, roll, pitch, yaw] in B, (6,), in m and rad.
+        tried: What it sees in `FOUND_ON`.
+        judged: What it sees in `JUDGED_ON`; None if it is not judged.
+        guided: The captures that it has guided; None if it is not judged.
+    """
+
+    name: str
+    rule: str
+    pose: Array
+    tried: Look
+    judged: Look | None = None
+    guided: Guided | None = None
+
+    @staticmethod
+    def of(kept: Mapping[str, Any]) -> Placement:
+        """Return what was kept."""
+        judged, guided = kept["judged"], kept["guided"]
+        return Placement(
+            kept["name"],
+            kept["rule"],
+            np.array(kept["pose"]),
+            Look.of(kept["tried"]),
+            None if judged is None else Look.of(judged),
+            None if guided is None else Guided(*(np.array(guided[k], dtype=float) for k in ("times", "errors"))),
+        )
+
+
+SEARCH = "search"
 
 
 @dataclass(frozen=True)
@@ -230,197 +435,323 @@ class MountAnswer:
     """The answer to O1.
 
     Attributes:
-        best: The placement that was found.
-        by_hand: The placements of `BY_HAND`.
-        afterwards: The placements of `AFTERWARDS`, which do not count for `holds`.
-        landscape: Rollouts on a grid over the position, with the view as in the best placement.
+        placements: The placement that was found, and all by hand.
+        candidates: How many placements the search has tried.
+        status: How COBYLA ended, in its own words.
+        grid: The slice over the position with the view as found: ``y`` and ``z`` in m, ``mean`` and ``most`` markers in
+            a capture of `FOUND_ON`, shape (y, z), NaN where the arm is; empty if it is missing.
     """
 
-    best: Placement
-    by_hand: tuple[Placement, ...]
-    afterwards: tuple[Placement, ...]
-    landscape: Sweep
+    placements: tuple[Placement, ...]
+    candidates: int
+    status: str
+    grid: Mapping[str, Array]
+
+    def with_placement(self, placement: Placement) -> MountAnswer:
+        """Return the answer with further results of a placement."""
+        key = placement.name, placement.rule
+        return replace(self, placements=tuple(placement if (p.name, p.rule) == key else p for p in self.placements))
 
     @property
-    def gain(self) -> float:
-        """Return by how many markers the best placement sees more than the best by hand, in the mean.
-
-        NaN if a capture with one of them failed, so that nothing is claimed.
-        """
-        return float(self.best.mean - np.max([placement.mean for placement in self.by_hand]))
+    def best(self) -> Placement:
+        """Return the placement that was found."""
+        return next(placement for placement in self.placements if placement.rule == SEARCH)
 
     @property
-    def best_on_grid(self) -> float:
-        """Return the mean number of markers at the best point of the grid that keeps off the arm.
+    def judged(self) -> list[Placement]:
+        """Return the placements that are judged: the one found, and the best of each rule."""
+        return [placement for placement in self.placements if placement.judged is not None]
 
-        NaN if a rollout failed, so that nothing is claimed.
+    @property
+    def well_aimed(self) -> Placement:
+        """Return the best placement by hand on `FOUND_ON`, which an engineer would take."""
+        return max((p for p in self.judged if p.rule != SEARCH), key=lambda p: p.tried.mean)
+
+    def gain(self, placement: Placement | None = None) -> tuple[float, float, float]:
+        """Return by how many markers the one found sees more, in the mean of `JUDGED_ON`, and its interval of 90 %.
+
+        Args:
+            placement: The placement beside it; by default `well_aimed`.
+
+        Returns:
+            (lower, mean, upper), by Student's t of the differences in each capture.
         """
-        if self.landscape.failed.any():
-            return float("nan")
-        values = [e.values[0] for e in self.landscape.evaluations if e.violations[0] <= 0.0]
-        return float(np.max(values)) / HORIZON
+        beside = (placement or self.well_aimed).judged
+        assert self.best.judged is not None and beside is not None
+        gains = self.best.judged.means - beside.means
+        half = float(student.ppf(0.95, len(gains) - 1) * gains.std(ddof=1) / np.sqrt(len(gains)))
+        return float(gains.mean()) - half, float(gains.mean()), float(gains.mean()) + half
+
+    @property
+    def verdict(self) -> str:
+        """Return in words what the search is worth beside the best placement by hand."""
+        lower, mean, upper = self.gain()
+        if lower > 0.0 and mean > TELLING:
+            return "better than the best placement by hand"
+        if upper < 0.0 and mean < -TELLING:
+            return "worse than the best placement by hand"
+        return "no better than a well-aimed placement by hand"
 
     @property
     def holds(self) -> bool:
-        """Return whether it sees more than each placement by hand, and no point of the grid sees more."""
-        return self.gain > TELLING and self.best_on_grid < self.best.mean + TELLING
+        """Return whether enough captures were judged, and the placement found is not worse than one by hand.
+
+        A placement that ignores how the base reacts must be worse by what means anything: else nothing was asked.
+        """
+        still = [placement for placement in self.judged if placement.rule == STILL]
+        enough = all(p.judged is not None and len(p.judged.means) >= len(JUDGED_ON) for p in self.judged)
+        not_worse = all(self.gain(p)[2] > 0.0 for p in self.judged if p.rule != SEARCH)
+        return enough and not_worse and bool(still) and all(self.gain(p)[0] > TELLING for p in still)
+
+    @staticmethod
+    def of(kept: Mapping[str, Any]) -> MountAnswer:
+        """Return what was kept."""
+        grid = {key: np.array(values, dtype=float) for key, values in kept["grid"].items()}
+        placements = tuple(Placement.of(placement) for placement in kept["placements"])
+        return MountAnswer(placements, kept["candidates"], kept["status"], grid)
 
 
-def find_mount(*, seeds: Sequence[int], candidates: int, grid: int, executor: Executor) -> MountAnswer:
-    """Search the best placement, compare it with those by hand, and with a grid over the position.
+def search_mount(
+    problem: vtb.Problem, starts: Sequence[Array], *, first: int = GLOBAL, then: int = LOCAL
+) -> tuple[Array, int, str]:
+    """Search the best placement: by the default solver, then by COBYLA through Drake's MathematicalProgram.
 
     Args:
-        seeds: Seeds of the captures.
-        candidates: How many placements the search tries.
-        grid: The number of points of the grid per side.
-        executor: Runs the rollouts.
+        problem: The problem of `mount_problem`.
+        starts: Placements that are tried first.
+        first: How many placements the default solver tries beside these.
+        then: How many COBYLA tries, from the best so far.
+
+    Returns:
+        The best pose, how many placements were tried, and how COBYLA ended.
     """
-    problem = mount_problem(seeds=seeds)
+    captures_each, tried = len(problem.conditions), len(starts) + first
     with problem.study() as study:
-        study.run(rollouts=candidates * len(seeds), racing=False, executor=executor, progress=False)
-        y, z, roll, yaw = study.best.point
-    poses = {"found": _ENTRIES.array(x=_X, y=y, z=z, roll=roll, yaw=yaw), **BY_HAND, **AFTERWARDS}
-    turns = {_address("roll"): float(roll), _address("yaw"): float(yaw)}
-    around = mount_problem(PARAMETERS[:2], seeds=seeds, fixed=turns)
-    landscape = around.sweep(grid, executor=executor, progress=False)
-    every = problem.sweep(values=[entries(value) for value in poses.values()], executor=executor, progress=False)
-    rows = np.reshape(np.array(every.rollouts, dtype=object), (len(poses), len(seeds)))
-    placements = [Placement(name, value, tuple(row)) for (name, value), row in zip(poses.items(), rows, strict=True)]
-    last = 1 + len(BY_HAND)
-    return MountAnswer(placements[0], tuple(placements[1:last]), tuple(placements[last:]), landscape)
+        for value in starts:
+            study.intervene("try", point={p.address: float(v) for p, v in zip(problem.parameters, value, strict=True)})
+        study.run(rollouts=tried * captures_each, racing=False, executor="serial", progress=False)
+        study.intervene("budget", rollouts=(tried + then) * captures_each)
+        study.intervene("solver", solver="LN_COBYLA")
+        study.run(rollouts=(tried + then) * captures_each, racing=False, executor="serial", progress=False)
+        return np.array(study.best.point), len(study) // captures_each, f"{study.reason}: {study.message}"
 
 
-def views(poses: Sequence[Array], *, seed: int = SEEDS[0]) -> list[list[Array]]:
+def position_slice(look: Callable[[Array], Look], best: Array, points: int = 4) -> dict[str, Array]:
+    """Return the counts over the position on the face, with the view as in the best placement.
+
+    Args:
+        look: Returns what a placement sees.
+        best: The best pose.
+        points: The number of points per side.
+    """
+    axis = np.linspace(-_REACH, _REACH, points)
+    mean, most = np.full((2, points, points), np.nan)
+    for i, y in enumerate(axis):
+        for k, z in enumerate(axis):
+            value = best.copy()
+            value[1:3] = y, z
+            if distance_from_foot(value) >= _FOOT:
+                seen_there = look(value)
+                mean[i, k], most[i, k] = seen_there.mean, seen_there.most
+    return {"y": axis, "z": axis, "mean": mean, "most": most}
+
+
+def judged_placements(tried: Sequence[Placement]) -> list[Placement]:
+    """Return the placements that are judged: the one found, and the best of each rule on `FOUND_ON`."""
+    best = [max((p for p in tried if p.rule == rule), key=lambda p: p.tried.mean) for rule in RULES]
+    return [*(p for p in tried if p.rule == SEARCH), *best]
+
+
+def try_placements(echo: Callable[[str], Any] = print) -> MountAnswer:
+    """Try the placements by hand, search a better one, and return all of them, not judged yet."""
+    onlooker = Onlooker(FOUND_ON)
+    tried = []
+    for rule in RULES:
+        for name, value in by_hand(rule).items():
+            tried.append(Placement(name, rule, value, onlooker.look(value)))
+            echo(f"{name}, {rule}: {tried[-1].tried.mean:.2f}")
+    value, candidates, status = search_mount(onlooker.problem, [p.pose for p in judged_placements(tried)])
+    best = Placement(SEARCH, SEARCH, value, onlooker.look(value))
+    echo(f"{_place(best)}: {best.tried.mean:.2f} of {candidates}; {status}")
+    return MountAnswer((best, *tried), candidates, status, {})
+
+
+def answer_mount(
+    answer: MountAnswer | None = None,
+    *,
+    keep: Callable[[MountAnswer], Any] = lambda answer: None,
+    echo: Callable[[str], Any] = print,
+) -> MountAnswer:
+    """Answer O1, which takes about 8 minutes of processor time.
+
+    Args:
+        answer: The results so far; None: nothing.
+        keep: Gets the answer after each step.
+        echo: Gets a line for each step.
+    """
+    if answer is None:
+        answer = try_placements(echo)
+        keep(answer)
+    onlooker = Onlooker(JUDGED_ON)
+    for placement in judged_placements(answer.placements):
+        if placement.judged is None:
+            look = onlooker.look(placement.pose)
+            echo(f"{placement.name}, {placement.rule}: {look.mean:.2f}")
+            answer = answer.with_placement(replace(placement, judged=look))
+            keep(answer)
+    for placement in answer.judged:
+        if placement.guided is None:
+            guided = guide(placement.pose, JUDGED_ON[:GUIDED])
+            echo(f"{placement.name}, {placement.rule}: guides {guided.successes} of {GUIDED}")
+            answer = answer.with_placement(replace(placement, guided=guided))
+            keep(answer)
+    if not answer.grid:
+        answer = replace(answer, grid=position_slice(Onlooker(FOUND_ON[2:3]).look, answer.best.pose))
+        keep(answer)
+    return answer
+
+
+def compare_again(answer: MountAnswer, numbers: Sequence[int]) -> float:
+    """Judge the placements on some of the captures again, and return the largest difference of a mean count.
+
+    Args:
+        answer: The kept answer.
+        numbers: Numbers of captures of `JUDGED_ON`.
+    """
+    onlooker = Onlooker([JUDGED_ON[number] for number in numbers])
+    differences = [
+        np.abs(onlooker.look(p.pose).means - p.judged.means[list(numbers)]).max()
+        for p in answer.judged
+        if p.judged is not None
+    ]
+    return float(np.max(differences))
+
+
+# -- pictures and words
+
+
+def views(poses: Sequence[Array], *, on: Capture = JUDGED_ON[2]) -> list[list[Array]]:
     """Return what a camera sees in one capture from each of some poses, at the sample times: images (h, w, 3)."""
-    problem = mount_problem(seeds=[seed])
-    runner = RolloutRunner(replace(problem.task, record=[IMAGE]), problem.testbed)
-    rollouts = [runner.run(problem.values(entries(value), condition=0)) for value in poses]
+    onlooker = Onlooker([on])
+    rollouts = [onlooker.rollout(value) for value in poses]
     return [[image.data[..., :3] for image in rollout.record[IMAGE]] for rollout in rollouts]
 
 
-def plot_answer(answer: MountAnswer, *, times: Sequence[float] = (2.0, 6.0, 10.0, 14.0, 18.0, 22.0)) -> Figure:
-    """Draw the landscape over the position, the counts over time, and the views of all placements.
+def plot_answer(answer: MountAnswer) -> Figure:
+    """Draw the slice over the position, the counts over time, and the views of the placements that are judged.
 
-    Left above: the mean count over the position of the camera, with the placements; the view is turned as in the best.
-    Beside it the paper's quality, the maximum over time, which has plateaus. Right: the counts over time. Below: what
-    each placement sees in the first capture, at about the time at which the markers were counted.
-
-    Args:
-        answer: The answer.
-        times: Times of the images in s.
+    Left above: the mean count over the position of the camera, with the placements; the view is turned as in the one
+    found. Beside it the paper's quality, the maximum over time, which has plateaus. Right: the counts over time. Below:
+    what each placement sees in one capture.
     """
-    placements = [answer.best, *answer.by_hand]
+    placements = answer.judged
     figure = Picture(14.0, 4.6 + 1.35 * len(placements))
     above, below = figure.subfigures(2, 1, height_ratios=[4.6, 1.35 * len(placements)])
     mean_axes, most_axes, time_axes = above.subplots(1, 3)
-    _draw_landscape(mean_axes, answer, _mean_at, "mean number of markers")
-    _draw_landscape(most_axes, answer, _most_at, "largest number of markers (the paper's)")
+    _draw_slice(mean_axes, answer, "mean", "mean number of markers")
+    _draw_slice(most_axes, answer, "most", "largest number of markers (the paper's)")
+    times = SAMPLE_PERIOD * np.arange(1, 1 + placements[0].tried.counts.shape[1])
     for k, placement in enumerate(placements):
-        counts = np.mean([rollout.quality for rollout in placement.rollouts], axis=0)
-        best = placement is answer.best
-        style = {"color": BEST, "lw": 2.5} if best else {"color": f"C{k - 1}", "lw": 1.2}
-        label = f"{placement.name}: {placement.mean:.2f}"
-        time_axes.plot(placement.rollouts[0].times, counts, drawstyle="steps-pre", label=label, **style)
-    time_axes.set(xlabel="time [s]", ylabel="markers detected", title=f"Mean of {len(answer.best.rollouts)} captures")
-    time_axes.set_ylim(0.0, 1.0 + 1.4 * max(placement.most for placement in placements))
+        assert placement.judged is not None
+        style = {"color": BEST, "lw": 2.5} if placement.rule == SEARCH else {"color": f"C{k - 1}", "lw": 1.2}
+        label = f"{placement.name}, {placement.rule}: {placement.judged.mean:.2f}"
+        time_axes.plot(times, placement.judged.counts.mean(axis=0), drawstyle="steps-pre", label=label, **style)
+    time_axes.set(xlabel="time [s]", ylabel="markers detected", title=f"Mean of {len(JUDGED_ON)} captures")
+    time_axes.set_ylim(0.0, 12.0)
     time_axes.legend(fontsize="x-small", loc="upper right")
     finish(time_axes)
     grid = below.subplots(len(placements), len(times))
     images = views([placement.pose for placement in placements])
     for row, placement, images_of_placement in zip(grid, placements, images, strict=True):
-        first = placement.rollouts[0]
-        for axes, t in zip(row, times, strict=True):
-            index = int(np.argmin(np.abs(first.times - t)))
-            axes.imshow(images_of_placement[index])
+        for axes, image, t in zip(row, images_of_placement[1:], times, strict=True):
+            axes.imshow(image)
             axes.set(xticks=[], yticks=[])
-            axes.set_xlabel(f"{first.times[index]:g} s: {first.quality[index]:g}", fontsize="x-small", labelpad=1)
-        row[0].set_ylabel(placement.name.replace(" of ", "\nof ").replace(" corner", "\ncorner"), fontsize="x-small")
+            axes.set_xlabel(f"{t:g} s", fontsize="x-small", labelpad=1)
+        row[0].set_ylabel(f"{placement.name},\n{placement.rule}".replace(" by ", "\nby "), fontsize="xx-small")
     return figure
 
 
-def _mean_at(rollouts: Sequence[RolloutResult]) -> float:
-    return float(np.mean([mean_count(rollout) for rollout in rollouts]))
-
-
-def _most_at(rollouts: Sequence[RolloutResult]) -> float:
-    return float(np.mean([rollout.quality.max() if not rollout.failed else np.nan for rollout in rollouts]))
-
-
-def _draw_landscape(
-    axes: Axes, answer: MountAnswer, number: Callable[[Sequence[RolloutResult]], float], title: str
-) -> None:
-    points, groups = np.unique(answer.landscape.points, axis=0, return_inverse=True)
-    rollouts = [[answer.landscape.rollouts[i] for i in np.flatnonzero(groups == k)] for k in range(len(points))]
-    y, z = np.unique(points[:, 0]), np.unique(points[:, 1])
-    values = np.array([number(group) for group in rollouts]).reshape(y.size, z.size).T
+def _draw_slice(axes: Axes, answer: MountAnswer, key: str, title: str) -> None:
+    y, z, values = (answer.grid[k] for k in ("y", "z", key))
     figure = axes.figure
-    figure.colorbar(draw_mesh(axes, y, z, values), ax=axes, pad=0.02)
-    for k, placement in enumerate(answer.by_hand):
-        y_placed, z_placed, *_ = entries(placement.pose)
-        axes.plot(y_placed, z_placed, "o", color=f"C{k}", mec="white")
-    y_best, z_best, *_ = entries(answer.best.pose)
-    mark_best(axes, y_best, z_best)
+    figure.colorbar(draw_mesh(axes, y, z, values.T), ax=axes, pad=0.02)
+    for k, placement in enumerate(placement for placement in answer.judged if placement.rule != SEARCH):
+        axes.plot(*placement.pose[1:3], "o", color=f"C{k}", mec="white")
+    mark_best(axes, *answer.best.pose[1:3])
     axes.add_patch(Circle(Servicer().shoulder[1:], _FOOT, fill=False, color="white", ls=":"))
     axes.set(xlabel="y in B [m]", ylabel="z in B [m]", title=title)
-
-
-def answer_mount(*, full: bool = False) -> MountAnswer:
-    """Answer O1 with two worker processes; see `find_mount`."""
-    with ProcessExecutor(2) as executor:
-        return find_mount(
-            seeds=SEEDS if full else SEEDS[:FEW],
-            candidates=200 if full else 36,
-            grid=13 if full else 4,
-            executor=executor,
-        )
 
 
 def mount(full: bool) -> Answer:
     """Answer O1: where should the docking camera sit?
 
-    The short version averages over the first `FEW` captures, the long one over all of `SEEDS`, with a finer grid.
+    The short version reads the kept results, and judges the placements anew on `RERUN` captures drawn at random.
     """
-    result = answer_mount(full=full)
-    by_hand, afterwards = (
-        "; ".join(f"{p.name} {p.mean:.2f} (largest {p.most:.1f})" for p in placements)
-        for placements in (result.by_hand, result.afterwards)
+    result = answer_mount() if full else MountAnswer.of(read_results(RESULTS))
+    numbers = sorted(np.random.default_rng().choice(len(JUDGED_ON), RERUN, replace=False).tolist())
+    difference = 0.0 if full else compare_again(result, numbers)
+    lower, mean, upper = result.gain()
+    looks = "; ".join(_words(placement) for placement in result.judged)
+    again = (
+        "" if full else f"Captures {numbers} judged again: means differ by {difference:.2g} at most (kept results). "
     )
     return Answer(
         id="O1",
         question="Where should the docking camera sit to see the most markers during the capture?",
-        answer=f"{_place(result.best)}: {result.best.mean:.2f} markers in the mean",
+        answer=f"{_place(result.best)}: {mean:+.2f} markers beside the best by hand; {result.verdict}",
         unit="",
-        interval=None,
+        interval=(lower, upper),
         paper="none given",
-        cases=f"{len(result.best.rollouts)} captures",
-        held_out="",
-        baseline=f"by hand: {by_hand}",
-        holds=result.holds,
-        note=f"Thought of afterwards: {afterwards}. Largest of the one found "
-        f"{result.best.most:.1f}. Best of the grid over the position: {result.best_on_grid:.2f}. Mean of "
-        f"{len(result.best.rollouts)} captures; differences under {TELLING} mean nothing.",
+        cases=f"{len(FOUND_ON)} captures, one at each of {len(TUMBLES)} tumble rates",
+        held_out=f"{len(JUDGED_ON)} others at the same rates",
+        baseline=f"{result.well_aimed.name}, {result.well_aimed.rule}: the best by hand",
+        holds=result.holds and difference < TELLING,
+        note=f"{again}Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing.",
     )
+
+
+def _words(placement: Placement) -> str:
+    look, guided = placement.judged, placement.guided
+    assert look is not None
+    return (
+        f"{placement.name}, {placement.rule}: {look.mean:.2f} markers in the mean, {look.most:.1f} at most, a pose in "
+        f"{look.posed:.0%} of the images, {1e3 * look.accuracy:.2f} mm off in the median"
+    ) + ("" if guided is None else f"; guides {guided.successes} of {len(guided.times)} captures")
 
 
 def _place(placement: Placement) -> str:
     """Return where a placement is, and where it looks."""
-    y, z, roll, yaw = entries(placement.pose)
-    up, left = np.degrees([roll + np.pi / 2, yaw + np.pi / 2])
+    camera = _ENTRIES.view(placement.pose)
+    ahead, left, up = pose_from_array(placement.pose).rotation().matrix()[:, 2]
     side = "left" if left >= 0.0 else "right"
-    return f"at y = {y:.2f} m, z = {z:.2f} m, {up:.0f} deg up, {abs(left):.0f} deg to the {side}"
+    return (
+        f"at x = {camera.x:.2f}, y = {camera.y:.2f}, z = {camera.z:.2f} m, "
+        f"{np.degrees(np.arctan2(up, np.hypot(ahead, left))):.0f} deg up, "
+        f"{abs(np.degrees(np.arctan2(left, ahead))):.0f} deg to the {side}, "
+        f"twisted by {np.degrees(camera.pitch):.0f} deg"
+    )
 
 
 @click.command()
-@click.option("--full", is_flag=True, help="All captures, and a finer grid.")
+@click.option("--full", is_flag=True, help="Do what is missing in the kept results first, and keep it.")
 @click.option("--figure", default="mount.png", help="File of the picture.", show_default=True)
 def main(full: bool, figure: str) -> None:
     """Answer O1, and draw the answer."""
-    result = answer_mount(full=full)
-    click.echo(f"{'placement':38} {'mean':>5} {'largest':>7}")
-    for placement in (result.best, *result.by_hand, *result.afterwards):
-        click.echo(f"{placement.name:38} {placement.mean:5.2f} {placement.most:7.1f}")
-    click.echo(f"found {_place(result.best)}; best of the grid: {result.best_on_grid:.2f}; holds: {result.holds}")
+    result = MountAnswer.of(read_results(RESULTS)) if RESULTS.exists() else None
+    if full or result is None:
+        result = answer_mount(result, keep=lambda answer: write_results(RESULTS, answer, command=COMMAND))
+    for placement in result.placements:
+        click.echo(f"{placement.name}, {placement.rule}: {placement.tried.mean:.2f} where they were found")
+    for placement in result.judged:
+        click.echo(f"{_words(placement)}; the one found sees {_gain(result, placement)} more")
+    click.echo(f"found {_place(result.best)} by {result.candidates} placements ({result.status})")
+    click.echo(f"{result.verdict}; holds: {result.holds}")
     plot_answer(result).savefig(figure, dpi=110)
+
+
+def _gain(answer: MountAnswer, placement: Placement) -> str:
+    lower, mean, upper = answer.gain(placement)
+    return f"{mean:.2f} [{lower:.2f}, {upper:.2f}]"
 
 
 if __name__ == "__main__":

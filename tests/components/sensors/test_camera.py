@@ -299,6 +299,15 @@ def test_black_stays_black_without_noise_sources() -> None:
     assert shown[0, 0, :3].max() == 0
 
 
+def test_without_exposure_nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene()
+    context = scene.context()
+    assert scene.render(context).max() > 0
+    monkeypatch.setattr("vtbdrake.components.sensors.camera.RenderedView", None)
+    scene.set(context, "exposure", 0.0)
+    assert scene.render(context).max() == 0
+
+
 def noisy(seed: int = 5) -> Scene:
     return Scene(LightConfig(direction=[1.0, 0.5, -0.3]), photon_noise=5.0, errors=ErrorModel(noise=1.0, seed=seed))
 

@@ -109,7 +109,8 @@ class Camera(AddressedSystem):
     A pixel saturates last: m is the sum of all light after shadows and haze, and may exceed S, up to 64 S. What is
     brighter than S is rendered again with a quarter of the exposure, as often as needed, so that m is known to 1 %.
     noise is the standard deviation of the read noise, and photon_noise the standard deviation of the shot noise of a
-    pixel at full scale, both at gain 1, in counts. So gain brightens both, exposure only the image. Other errors are as
+    pixel at full scale, both at gain 1, in counts. So gain brightens both, exposure only the image. Without exposure
+    nothing is rendered. Other errors are as
     in the `ErrorModel`: latency in periods, and drop-out, after which the last image stays; all a function of the seed.
 
     The variables ``seed``, ``noise``, ``photon_noise``, ``exposure``, ``gain``, ``lamp`` (the brightness of a white
@@ -342,6 +343,8 @@ class Camera(AddressedSystem):
         view = scene.view(query, illumination)
         X_WC = self.X_WC(context)
         self._check_outside(view, X_WC.translation())
+        if not illumination.exposure and not self._has_depth:
+            return np.zeros((self._height, self._width, 3), np.float32), None
         camera = RenderedView(
             scene, view, self.info(context), (self._clipping_near, self._clipping_far), X_WC, points=self._supersampling
         )
