@@ -640,16 +640,17 @@ def views(poses: Sequence[Array], *, on: Capture = JUDGED_ON[2]) -> list[list[Ar
 def plot_answer(answer: MountAnswer) -> Figure:
     """Draw the slice over the position, the counts over time, and the views of the placements that are judged.
 
-    Left above: the mean count over the position of the camera, with the placements; the view is turned as in the one
-    found. Beside it the paper's quality, the maximum over time, which has plateaus. Right: the counts over time. Below:
-    what each placement sees in one capture.
+    Left above, if it was computed: the mean count over the position of the camera, with the placements; the view is
+    turned as in the one found. Beside it the paper's quality, the maximum over time, which has plateaus. Right: the
+    counts over time. Below: what each placement sees in one capture.
     """
     placements = answer.judged
     figure = Picture(14.0, 4.6 + 1.35 * len(placements))
     above, below = figure.subfigures(2, 1, height_ratios=[4.6, 1.35 * len(placements)])
-    mean_axes, most_axes, time_axes = above.subplots(1, 3)
-    _draw_slice(mean_axes, answer, "mean", "mean number of markers")
-    _draw_slice(most_axes, answer, "most", "largest number of markers (the paper's)")
+    *slices, time_axes = above.subplots(1, 3 if answer.grid else 1, squeeze=False)[0]
+    titles = {"mean": "mean number of markers", "most": "largest number of markers (the paper's)"}
+    for axes, (key, title) in zip(slices, titles.items(), strict=False):
+        _draw_slice(axes, answer, key, title)
     times = SAMPLE_PERIOD * np.arange(1, 1 + placements[0].tried.counts.shape[1])
     for k, placement in enumerate(placements):
         assert placement.judged is not None
