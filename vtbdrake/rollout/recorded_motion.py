@@ -183,7 +183,9 @@ class MotionPlayer:
         """
         of_testbed = _RECORDINGS.setdefault(self._testbed, {})
         recorded_with = tuple((key, np.asarray(value).tobytes()) for key, value in self.motion.while_recording.items())
-        return of_testbed.setdefault((self.motion.memory, tuple(self._following), recorded_with, instants.tobytes()), {})
+        return of_testbed.setdefault(
+            (self.motion.memory, tuple(self._following), recorded_with, instants.tobytes()), {}
+        )
 
     def state(self, context: Context) -> FlatState:
         """Return the state from which a window begins."""

@@ -447,6 +447,11 @@ class MountAnswer:
     status: str
     grid: Mapping[str, Array]
 
+    def twin(self, placement: Placement) -> Placement | None:
+        """Return another placement with the same pose, if there is one: the search may end where it began."""
+        same = [p for p in self.placements if p.rule != placement.rule and np.array_equal(p.pose, placement.pose)]
+        return same[0] if same else None
+
     def with_placement(self, placement: Placement) -> MountAnswer:
         """Return the answer with further results of a placement."""
         key = placement.name, placement.rule
@@ -486,6 +491,8 @@ class MountAnswer:
     def verdict(self) -> str:
         """Return in words what the search is worth beside the best placement by hand."""
         lower, mean, upper = self.gain()
+        if self.twin(self.best) is not None:
+            return "the search ends at the best placement by hand"
         if lower > 0.0 and mean > TELLING:
             return "better than the best placement by hand"
         if upper < 0.0 and mean < -TELLING:
@@ -500,7 +507,7 @@ class MountAnswer:
         """
         still = [placement for placement in self.judged if placement.rule == STILL]
         enough = all(p.judged is not None and len(p.judged.means) >= len(JUDGED_ON) for p in self.judged)
-        not_worse = all(self.gain(p)[2] > 0.0 for p in self.judged if p.rule != SEARCH)
+        not_worse = all(self.gain(p)[2] >= 0.0 for p in self.judged if p.rule != SEARCH)
         return enough and not_worse and bool(still) and all(self.gain(p)[0] > TELLING for p in still)
 
     @staticmethod
@@ -595,13 +602,15 @@ def answer_mount(
     onlooker = Onlooker(JUDGED_ON)
     for placement in judged_placements(answer.placements):
         if placement.judged is None:
-            look = onlooker.look(placement.pose)
+            twin = answer.twin(placement)
+            look = (twin and twin.judged) or onlooker.look(placement.pose)
             echo(f"{placement.name}, {placement.rule}: {look.mean:.2f}")
             answer = answer.with_placement(replace(placement, judged=look))
             keep(answer)
     for placement in answer.judged:
         if placement.guided is None:
-            guided = guide(placement.pose, JUDGED_ON[:GUIDED])
+            twin = answer.twin(placement)
+            guided = (twin and twin.guided) or guide(placement.pose, JUDGED_ON[:GUIDED])
             echo(f"{placement.name}, {placement.rule}: guides {guided.successes} of {GUIDED}")
             answer = answer.with_placement(replace(placement, guided=guided))
             keep(answer)

@@ -166,7 +166,8 @@ def look(mean, count=20, spread=0.1):
 
 
 def placement(name, rule, tried, judged=None, **options):
-    return Placement(name, rule, pose(0.0, 0.0), look(tried, 5), None if judged is None else look(judged, **options))
+    value = pose(0.01 * (judged or 0.0), 0.0)
+    return Placement(name, rule, value, look(tried, 5), None if judged is None else look(judged, **options))
 
 
 def answer(search, still, aware, **options):
@@ -190,6 +191,14 @@ def test_search_is_compared_with_the_placement_an_engineer_would_take():
     alike = answer(4.05, 2.0, 4.0)
     assert alike.verdict.startswith("no better")
     assert alike.holds
+
+
+def test_search_may_end_where_it_began():
+    alike = answer(4.0, 2.0, 4.0)
+    assert alike.twin(alike.best).rule != SEARCH
+    assert alike.gain() == (0.0, 0.0, 0.0)
+    assert alike.holds
+    assert alike.verdict == "the search ends at the best placement by hand"
 
 
 @pytest.mark.parametrize(
