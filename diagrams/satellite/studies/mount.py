@@ -7,8 +7,8 @@ arm stands, too. All six numbers of its pose are decided.
 The choices that influence the answer were fixed before the first placement was judged:
 
 * the captures: placements are found on `FOUND_ON`, and judged on `JUDGED_ON`, each at five tumble rates;
-* the placements by hand: the places `PLACES`, each aimed by the rules `RULES`, of which one knows how the base reacts
-  to the arm. The best of each rule on `FOUND_ON` is judged beside the placement found;
+* the placements by hand: the places `PLACES`, each aimed by the rules `RULES`. One rule knows how the base reacts to
+  the arm. The best of each rule on `FOUND_ON` is judged beside the placement found;
 * the time that counts: from the start until the base and the target rest against each other, `HORIZON`;
 * the light: the scenario's own;
 * the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths;
@@ -297,9 +297,9 @@ class Look:
         return float(np.nanmedian(self.errors)) if self.posed else float("nan")
 
     @staticmethod
-    def of(kept: Mapping[str, Any]) -> Look:
+    def of(stored: Mapping[str, Any]) -> Look:
         """Return what was kept."""
-        return Look(np.array(kept["counts"], dtype=float), np.array(kept["errors"], dtype=float))
+        return Look(np.array(stored["counts"], dtype=float), np.array(stored["errors"], dtype=float))
 
 
 class Onlooker:
@@ -414,14 +414,14 @@ class Placement:
     guided: Guided | None = None
 
     @staticmethod
-    def of(kept: Mapping[str, Any]) -> Placement:
+    def of(stored: Mapping[str, Any]) -> Placement:
         """Return what was kept."""
-        judged, guided = kept["judged"], kept["guided"]
+        judged, guided = stored["judged"], stored["guided"]
         return Placement(
-            kept["name"],
-            kept["rule"],
-            np.array(kept["pose"]),
-            Look.of(kept["tried"]),
+            stored["name"],
+            stored["rule"],
+            np.array(stored["pose"]),
+            Look.of(stored["tried"]),
             None if judged is None else Look.of(judged),
             None if guided is None else Guided(*(np.array(guided[k], dtype=float) for k in ("times", "errors"))),
         )
@@ -511,11 +511,11 @@ class MountAnswer:
         return enough and not_worse and bool(still) and all(self.gain(p)[0] > TELLING for p in still)
 
     @staticmethod
-    def of(kept: Mapping[str, Any]) -> MountAnswer:
+    def of(stored: Mapping[str, Any]) -> MountAnswer:
         """Return what was kept."""
-        grid = {key: np.array(values, dtype=float) for key, values in kept["grid"].items()}
-        placements = tuple(Placement.of(placement) for placement in kept["placements"])
-        return MountAnswer(placements, kept["candidates"], kept["status"], grid)
+        grid = {key: np.array(values, dtype=float) for key, values in stored["grid"].items()}
+        placements = tuple(Placement.of(placement) for placement in stored["placements"])
+        return MountAnswer(placements, stored["candidates"], stored["status"], grid)
 
 
 def search_mount(
