@@ -1,4 +1,4 @@
-"""A quadruped on its feet: steps with contact in a compiled Diagram, in Drake and in MuJoCo, on one core each."""
+"""Steps with contact in a compiled Diagram and in Drake, on one core each: a quadruped, and a climber in its crater."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from benchmarks.measure import HIGHER, Benchmark, interleaved, ratio
 from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, quadruped
 from vtbdrake.compiled import CompiledRollouts
 from vtbdrake.state.systems import collect
+from vtbdrake_diagrams.space_climber import CraterScenario
 
 STEP = 0.005  # s
 HORIZON = 2.0  # s
 ROLLOUTS = 64
+CLIMB = 20.0  # s
+CLIMBS = 8
 
 
 def compiled_contact(repeats: int = 5) -> list[Benchmark]:
@@ -71,6 +74,40 @@ def compiled_contact(repeats: int = 5) -> list[Benchmark]:
             ("quadruped", drake, ours, 20.0, "the same steps by Drake's SAP, on one core each"),
             ("quadruped_mujoco", mujocos, again, 1.5, "the same robot in MuJoCo, Newton solver, on one core each"),
         )
+    ]
+
+
+def compiled_contact_climber(repeats: int = 3) -> list[Benchmark]:
+    """Compare a mental rollout of the climber in a crater, its DPS included, with the same in Drake, by SAP.
+
+    The second row is the simulated time over the processor time of compiled rollouts.
+    """
+    scenario = CraterScenario().mental()
+    testbed, count = scenario.build(), round(CLIMB / scenario.period)
+    headings = np.radians(np.linspace(-45.0, 45.0, CLIMBS))
+    rollouts = testbed.compiled(
+        horizon=CLIMB, sample_period=2.0, parameters=["u.heading"], outputs=["sim.sys.climber.base.height"]
+    )
+
+    def in_drake() -> None:
+        context = testbed.default_context()
+        testbed.write(context, {"u.heading": headings[0]})
+        testbed.simulator(context).AdvanceTo(CLIMB)
+
+    def compiled() -> None:
+        assert rollouts({"u.heading": headings}).valid.all()
+
+    of_drake, of_compiled = interleaved(in_drake, compiled, repeats=repeats)
+    drake, ours = of_drake / count, of_compiled / (count * CLIMBS)
+    note = (
+        f"us per step of {1e3 * scenario.period:g} ms with DPS and sensors: {1e6 * np.median(ours):.3g}, in Drake "
+        f"{1e6 * np.median(drake):.4g}; n = {repeats}"
+    )
+    against = "the same rollout by Drake's SAP, on one core each"
+    real_time = float(scenario.period / np.median(ours))
+    return [
+        Benchmark("compiled_contact_climber", ratio(drake, ours), "1", 20.0, HIGHER, against, note=note),
+        Benchmark("compiled_contact_climber_rtf", real_time, "1", 600.0, HIGHER, "real time, on one core", note=note),
     ]
 
 

@@ -38,6 +38,7 @@ BENCHMARKS: Registry = {
     "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
     "compiled_contact_quadruped": "benchmarks.compiled_contact:compiled_contact",
     "legged_replanning": "benchmarks.legged_replanning:legged_replanning",
+    "compiled_contact_climber": "benchmarks.compiled_contact:compiled_contact_climber",
     "compiled_testbed": "benchmarks.compiled_testbed:compiled_testbed",
     "compile_time": "benchmarks.compiled_testbed:compile_time",
     "hub_round_trip_p50": "benchmarks.hub:hub_round_trip_p50",

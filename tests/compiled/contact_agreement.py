@@ -1,6 +1,7 @@
 """The agreement of compiled contact with Drake's: after single steps, and in the outcomes of rollouts.
 
-``python -m tests.compiled.contact_agreement [--steps N] [--rollouts N]`` prints a line for each world.
+``python -m tests.compiled.contact_agreement [--steps N] [--rollouts N] [--worlds NAME ...]`` prints a line for each
+world.
 """
 
 from __future__ import annotations
@@ -91,9 +92,15 @@ def _in_drake(world: ContactWorld, begin: np.ndarray, times: np.ndarray) -> Outc
     simulator, plant = Simulator(world.diagram), world.plant
     own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositionsAndVelocities(own, begin)
+    states_until = np.inf
     states = [begin]  # An advance to the begin would make the first update.
     for time in times[1:]:
-        simulator.AdvanceTo(time)
+        if simulator.get_context().get_time() >= states_until:
+            states.append(states[-1])
+            continue
+        status = simulator.AdvanceTo(time)
+        if not status.succeeded():  # A system has ended the simulation.
+            states_until = simulator.get_context().get_time()
         states.append(np.array(plant.GetPositionsAndVelocities(own)))  # a view of the context
     return world.outcome(plant, plant.CreateDefaultContext(), np.array(states))
 
@@ -106,10 +113,13 @@ def main() -> None:
     """Print how steps and outcomes agree."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=1700, help="random states per world and approximation")
+    parser.add_argument("--worlds", nargs="*", default=list(WORLDS), choices=list(WORLDS), help="which worlds")
     parser.add_argument("--rollouts", type=int, default=100, help="random rollouts per world and approximation")
     arguments = parser.parse_args()
-    for name, make in WORLDS.items():
-        for approximation in ("sap", "lagged"):
+    for name in arguments.worlds:
+        make = WORLDS[name]
+        # The climber reasons by SAP.
+        for approximation in ("sap",) if name == "crater" else ("sap", "lagged"):
             errors = step_errors(make(approximation), arguments.steps)
             shares = outcome_shares(make(approximation), arguments.rollouts)
             print(

@@ -1,11 +1,12 @@
-"""Worlds in contact and their outcomes: a pushed puck, a gripper that holds a bar, a pushed quadruped."""
+"""Worlds in contact and their outcomes: a pushed puck, a gripper that holds a bar, a pushed quadruped, a climber."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, CollisionFilterDeclaration, Cylinder, GeometrySet, HalfSpace, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
@@ -14,6 +15,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from tests.compiled.quadruped import LEGS, POSTURE, inertia, quadruped, surface
+from vtbdrake_diagrams.space_climber import CraterScenario
+from vtbdrake_diagrams.space_climber.crater_scenario import TIPPED_OVER
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 
 
 @dataclass(frozen=True)
@@ -200,10 +204,44 @@ def pushed_quadruped(approximation: str, *, terrain: bool = False) -> ContactWor
     return ContactWorld(diagram, plant, 1.5, randomize, outcome)
 
 
+def crater_climber(approximation: str) -> ContactWorld:
+    """Return the testbed of the climber in a crater as it reasons, its DPS walking, somewhere on floor and wall."""
+    mental = CraterScenario().mental()
+    testbed = replace(mental, plant_config=_config(approximation, mental.period)).build()
+    crater, morphology = mental.crater, Morphology()
+    plant = testbed.plant
+    assert plant is not None
+
+    def randomize(plant: MultibodyPlant, context: Context, random: np.random.Generator) -> None:
+        plant.SetPositions(context, plant.GetDefaultPositions())
+        radius, azimuth = random.uniform(0.0, 36.0), random.uniform(-0.7, 0.7)
+        place = radius * np.array([np.cos(azimuth), np.sin(azimuth)])
+        height = float(crater.mesh_height(place + morphology.stance[:, :2]).max())
+        tilt = [*(0.05 * random.standard_normal(2)), 0.0]
+        sunk = random.uniform(0.0, 0.003)
+        base = RigidTransform(RollPitchYaw(tilt), [*place, height + morphology.torso_clearance - sunk])
+        plant.SetFreeBodyPose(context, plant.GetBodyByName("base"), base)
+        speed = random.choice([0.001, 0.05, 0.5])
+        plant.SetVelocities(context, speed * random.standard_normal(plant.num_velocities()))
+
+    def outcome(plant: MultibodyPlant, context: Context, states: np.ndarray) -> Outcome:
+        places = _places(plant, context, states, "base")
+        tilts = np.array([abs(RollPitchYaw(Quaternion(q / np.linalg.norm(q))).vector()[:2]) for q in states[:, :4]])
+        return Outcome(bool(tilts.max() > TIPPED_OVER), float(np.linalg.norm(places[-1, :2] - places[0, :2])))
+
+    return ContactWorld(testbed.diagram, plant, 12.0, randomize, outcome)
+
+
 def _places(plant: MultibodyPlant, context: Context, states: np.ndarray, name: str) -> np.ndarray:
     """Return the positions of a free body at the samples, shape (m, 3)."""
     start = plant.GetBodyByName(name).floating_positions_start() + 4
     return states[:, start : start + 3]
 
 
-WORLDS = {"puck": puck, "gripper": gripper, "quadruped": pushed_quadruped, "terrain": climbing_quadruped}
+WORLDS = {
+    "puck": puck,
+    "gripper": gripper,
+    "quadruped": pushed_quadruped,
+    "terrain": climbing_quadruped,
+    "crater": crater_climber,
+}

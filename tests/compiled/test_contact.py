@@ -432,7 +432,7 @@ def test_a_step_that_does_not_converge_ends_its_rollout_with_reason_and_time() -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(WORLDS))
+@pytest.mark.parametrize("name", sorted(WORLDS.keys() - {"crater"}))
 def test_outcomes_are_drakes(name: str) -> None:
     """Steps agree to rounding, and outcomes where Drake's do not depend on noise of 1e-9 at the begin."""
     world = WORLDS[name]("lagged")

@@ -346,7 +346,7 @@ class Walker:
         if ending <= 0.0:
             return ""
         path, message = self.endings[round(ending) - 1]
-        system, when = self._systems[path], f"{time:.0f}" if time.is_integer() else repr(time)
+        system, when = self._systems[path], f"{time:.0f}" if float(time).is_integer() else repr(float(time))
         return (
             f"Simulator returned early at time {when} because {type(system).__module__}.{type(system).__qualname__} "
             f"System '{system.GetSystemPathname()}' requested termination with message: \"{message}\""
