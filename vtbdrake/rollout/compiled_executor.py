@@ -24,7 +24,7 @@ from vtbdrake.rollout.runner import values_key
 from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
 from vtbdrake.rollout.task import HORIZON, TERMINATED, THRESHOLD, RolloutResult, RolloutTask, check_call
 from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Testbeds, split
-from vtbdrake.state.variables import A
+from vtbdrake.state.variables import A, Variable
 from vtbdrake.testbed import VirtualTestbed
 
 _log = logging.getLogger(__name__)
@@ -238,13 +238,15 @@ class _CompiledTask:
         variables = testbed.variables()
         # The state can be set anyway; masses and the like only if they are named.
         believed = [a for rule in testbed.belief_rules for a in rule.targets if variables[a].kind == A]
+        # Such as the pose of a body: it is set in a context, from which the state is read.
+        self._by_start = frozenset(a for a in addresses if _is_written_to_state(variables[a]))
         self._rollouts = CompiledRollouts(
             testbed.diagram,
             variables,
             s0,
             horizon=task.horizon,
             sample_period=task.sample_period,
-            parameters=list(dict.fromkeys([*addresses, *believed])),
+            parameters=list(dict.fromkeys([*(addresses - self._by_start), *believed])),
             outputs=list(dict.fromkeys([*task.record, *sampled])),
             measures=functions,
             timings=testbed.event_timings(),
@@ -269,7 +271,9 @@ class _CompiledTask:
     def varies(self, addresses: frozenset[str]) -> bool:
         """Return whether variables can be varied without compiling again."""
         if addresses not in self._varies:
-            self._varies[addresses] = all(self._rollouts.walker.can_vary(address) for address in addresses)
+            self._varies[addresses] = all(
+                self._rollouts.walker.can_vary(address) for address in addresses - self._by_start
+            )
         return self._varies[addresses]
 
     def run(self, points: Sequence[Parameters], starts: Sequence[Start | None]) -> list[RolloutResult | None]:
@@ -283,7 +287,8 @@ class _CompiledTask:
         for (_, addresses), indices in by_start.items():
             try:
                 z, t0 = self._begin(starts[indices[0]])
-                values = {a: np.array([points[i][a] for i in indices]) for a in addresses if not a.startswith(FIELD)}
+                entries = [a for a in addresses if not a.startswith(FIELD) and a not in self._by_start]
+                values = {a: np.array([points[i][a] for i in indices]) for a in entries}
                 filled = self._rollouts.filled(z, values)
             except StartError:
                 raise
@@ -292,6 +297,8 @@ class _CompiledTask:
                 continue
             if not values:
                 filled = np.repeat(filled, len(indices), axis=0)
+            if written := self._by_start.intersection(addresses):
+                filled = self._written(filled, [{a: points[i][a] for a in written} for i in indices])
             rows.setdefault(t0, []).append((indices, filled))
         for t0, parts in rows.items():
             batch = self._rollouts.from_z(np.concatenate([part for _, part in parts]), t0)
@@ -301,6 +308,21 @@ class _CompiledTask:
                 results[order[row]] = result
         self._duration = (time.perf_counter() - begun) / len(points)
         return results
+
+    def _written(self, z: np.ndarray, values: Sequence[Parameters]) -> np.ndarray:
+        """Return the vectors of state and parameters after values have been written that are no entries of them.
+
+        Args:
+            z: The vectors before, shape (n, nz).
+            values: The values of each, address -> value.
+        """
+        walker, context = self._rollouts.walker, self._start_context.context.Clone()
+        rows = []
+        for row, of_row in zip(z, values, strict=True):
+            walker.write(row, context)
+            walker.variables.write(context, of_row)
+            rows.append(walker.read(context))
+        return np.array(rows)
 
     def affordable(self, cutoff: Cutoff) -> int:
         """Return the number of rollouts that take about as long as is left; 0 after the deadline."""
@@ -451,6 +473,11 @@ class _CompiledTask:
         if task.threshold is None or task.run_on:
             return False
         return bool(exceeds(np.array(sample), task.threshold, minimize=task.minimize))
+
+
+def _is_written_to_state(variable: Variable) -> bool:
+    """Return whether a variable is no entry of the state, but what sets it writes into the state alone."""
+    return variable.kind != A and variable.place is None and not variable.derived and not variable.carried_by
 
 
 def _by_fields(points: Sequence[Parameters]) -> list[tuple[dict[str, Any], list[int]]]:
