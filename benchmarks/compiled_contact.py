@@ -103,11 +103,13 @@ def compiled_contact_climber(repeats: int = 3) -> list[Benchmark]:
         f"us per step of {1e3 * scenario.period:g} ms with DPS and sensors: {1e6 * np.median(ours):.3g}, in Drake "
         f"{1e6 * np.median(drake):.4g}; n = {repeats}"
     )
-    against = "the same rollout by Drake's SAP, on one core each"
-    real_time = float(scenario.period / np.median(ours))
+    rows = (
+        ("compiled_contact_climber", ratio(drake, ours), 20.0, "the same rollout by Drake's SAP, on one core each"),
+        ("compiled_contact_climber_rtf", float(scenario.period / np.median(ours)), 600.0, "real time, on one core"),
+    )
     return [
-        Benchmark("compiled_contact_climber", ratio(drake, ours), "1", 20.0, HIGHER, against, note=note),
-        Benchmark("compiled_contact_climber_rtf", real_time, "1", 600.0, HIGHER, "real time, on one core", note=note),
+        Benchmark(name=name, value=value, unit="1", goal=goal, better=HIGHER, against=against, note=note)
+        for name, value, goal, against in rows
     ]
 
 
