@@ -96,5 +96,5 @@ stale:
 clean:
 	rm -rf .venv .venv-* build dist docs/_api *.egg-info out answers.json benchmarks/results.json
 	rm -rf tools/javascript/node_modules .pytest_cache .hypothesis .mypy_cache .ruff_cache
-	find vtbdrake \( -name '*.so' -o -name 'lcmt_vtb_*.py' \) -delete
+	find vtbdrake diagrams \( -name '*.so' -o -name 'lcmt_vtb_*.py' \) -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -80,6 +80,21 @@ class BuildExt(build_ext):
                 ) from None
         super().build_extensions()
 
+    def run(self) -> None:
+        """Compile the modules; beside their sources, those whose source is gone are removed."""
+        super().run()
+        if self.inplace:
+            self._remove_stale_modules()
+
+    def _remove_stale_modules(self) -> None:
+        """Remove compiled modules whose source is gone: Python would prefer them to a .py of the same name."""
+        built = {Path(self.get_ext_fullpath(extension.name)).resolve() for extension in self.extensions}
+        suffix = self.get_ext_filename("module").removeprefix("module")
+        for package in _PACKAGES:
+            for path in (_ROOT / package).rglob(f"*{suffix}"):
+                if path.resolve() not in built:
+                    path.unlink()
+
 
 setup(
     cmdclass={"build_py": BuildPy, "build_ext": BuildExt},

@@ -1,8 +1,8 @@
 """The localization unit: the pose of a carrier on a map of landmarks, from detections and odometry.
 
 Without a pose, it gathers a local map along the odometry and matches it with the map, without an initial guess. Once a
-match is sure, it tracks. When the track is lost, it reports this, and searches again with landmarks detected from then
-on.
+match is sure, it tracks. When the track is lost, it reports this, and searches again with landmarks detected since it
+was in doubt.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class UnitState:
     Attributes:
         answer: The last answer.
         track: The state of the tracker; `TrackState.none` without a pose.
-        submap: The landmarks gathered since the start or the last loss; empty while there is a pose.
+        submap: The landmarks gathered since there was a pose, or since the start; empty while there is one.
         tried_at: Distance travelled in m and time in s at the last attempt of global localization, shape (2,).
         ignored: The number of calls that were ignored, see `LocalizationUnit.step`.
         losses: The number of times that the track was lost.
@@ -185,22 +185,25 @@ class LocalizationUnit:
             track, matches = self.tracker.update(predicted, landmarks)
             is_doubtful = self.tracker.is_doubtful(track)
             doubted = state.doubted + float(np.hypot(*motion[:2])) if is_doubtful else 0.0
-            if not self.tracker.is_lost(track) and doubted <= self.doubt_length:
+            if self.tracker.is_lost(track) or doubted > self.doubt_length:
+                # What was seen in doubt is of the same place.
+                lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
+                submap = self._gathered(state.submap, landmarks, pose, C)
+                return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
+            if is_doubtful:
+                answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
+                submap = self._gathered(state.submap, landmarks, pose, C)
+            else:
                 answer = self._answer(track, matches, len(landmarks), pose, time)
-                if is_doubtful:
-                    answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
-                return answer, replace(state, answer=answer, track=track, doubted=doubted)
-            lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
-            submap = Submap.empty(pose).with_scan(landmarks, least_deviation=self.locator.least_deviation)
-            return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
+                submap = Submap.empty(pose)
+            return answer, replace(state, answer=answer, track=track, submap=submap, doubted=doubted)
         return self._searched(state, landmarks, pose, C, time)
 
     def _searched(
         self, state: UnitState, landmarks: Landmarks, X_OH: Array, C: Array, time: float
     ) -> tuple[Localization, UnitState]:
         """Return the answer and the memory after a scan that follows an answer without a pose."""
-        submap = state.submap.moved(X_OH, C, length=self.submap_length)
-        submap = submap.with_scan(landmarks, least_deviation=self.locator.least_deviation)
+        submap = self._gathered(state.submap, landmarks, X_OH, C)
         none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
         state = replace(state, answer=none, submap=submap)
         gathered = submap.landmarks()
@@ -216,6 +219,11 @@ class LocalizationUnit:
             return none, state
         answer = self._answer(track, matches, len(landmarks), X_OH, time)
         return answer, UnitState(answer, track, Submap.empty(X_OH), ignored=state.ignored, losses=state.losses)
+
+    def _gathered(self, submap: Submap, landmarks: Landmarks, X_OH: Array, C: Array) -> Submap:
+        """Return the submap after a motion with covariance C and a scan."""
+        moved = submap.moved(X_OH, C, length=self.submap_length)
+        return moved.with_scan(landmarks, least_deviation=self.locator.least_deviation)
 
     def _answer(self, track: TrackState, matches: Matches, detected: int, X_OH: Array, time: float) -> Localization:
         covariance = self.tracker.pose_covariance(track)
