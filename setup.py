@@ -42,7 +42,7 @@ _DRAWS = {Path("vtbdrake/components/sensors/noise_kernel.pyx")}
 # Modules of testbeds that read recordings, which are not part of vtbdrake: they stay in the repository.
 _READ_RECORDINGS = {
     *(path.parent / path.stem for path in sorted(Path("vtbdrake_diagrams").glob("*/reality.py"))),
-    *(Path("vtbdrake_diagrams/park") / name for name in ("mower", "survey")),
+    *(Path("vtbdrake_diagrams/park") / name for name in ("few_landmarks", "mower", "survey")),
     *(Path("vtbdrake_diagrams/recorded_arms") / name for name in ("pendulum", "subjects")),
 }
 

@@ -25,7 +25,7 @@ EXT_SUFFIX = get_config_var("EXT_SUFFIX")
 SHARED = Path("vtbdrake/_cyutility")  # Cython's own part of all modules
 # What reads recordings, which are not part of vtbdrake, is in the repository only.
 READS_RECORDINGS = re.compile(
-    r"vtbdrake_diagrams/(\w+/reality|park/(mower|survey)|recorded_arms/(pendulum|subjects))\.py"
+    r"vtbdrake_diagrams/(\w+/reality|park/(few_landmarks|mower|survey)|recorded_arms/(pendulum|subjects))\.py"
 )
 
 

@@ -35,6 +35,8 @@ CLAIM = ("x", "y", "heading", "deviation", "status")
 _SCAN_EVERY = 9
 # The smallest number of landmarks with which a pose can be sure.
 _FEWEST = 8
+# The distance in m over which landmarks are gathered: a scan shows few, and the car does not slip.
+_GATHERED = 100.0
 # Standard deviation in m that is added to the detections', per axis: the axes of large or leaning trunks.
 _LEAST_DEVIATION = 0.03
 # Standard deviation of the displacement of a scan in m: its time is known to a period of the DPS, 7 ms at 3 m/s.
@@ -121,7 +123,9 @@ class ParkScenario(Scenario):
         locator = ConstellationMap(
             landmarks, fewest=_FEWEST, least_deviation=_LEAST_DEVIATION, correlation=self.correlation
         )
-        return LocalizationUnit(locator, tracker, drift=SteeringDriftModel(), begins_with_submap=True)
+        return LocalizationUnit(
+            locator, tracker, drift=SteeringDriftModel(), submap_length=_GATHERED, begins_with_submap=True
+        )
 
     def make_dps(self) -> Diagram:
         world_map = self.world_map()

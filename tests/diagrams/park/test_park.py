@@ -12,6 +12,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake_diagrams.park import ParkScenario
+from vtbdrake_diagrams.park.few_landmarks import Case, claims, thinned
 from vtbdrake_diagrams.park.reality import (
     judged_by_positions,
     laid_onto,
@@ -89,24 +90,43 @@ def test_points_are_laid_onto_others_by_a_rigid_motion():
     np.testing.assert_allclose(laid_onto(points, transform(X, points)), X)
 
 
+@pytest.fixture(scope="module")
+def drive():
+    return victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
+
+
+@pytest.fixture(scope="module")
+def half(drive):
+    return prepared(drive.between(0.0, 200.0))
+
+
 @pytest.mark.slow
-def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path):
+def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path, drive, half):
     """The end of the drive is where it began. The whole: python -m vtbdrake_diagrams.park.reality."""
-    drive = victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
-    half = prepared(drive.between(0.0, 200.0))
     end = drive.between(1477.0, 1500.0)
-    claims, report = localized(end, half.with_map(tmp_path), tmp_path / "drive.lcm")
+    found, report = localized(end, half.with_map(tmp_path), tmp_path / "drive.lcm")
     assert report.identical
-    assert claims.has_pose.mean() > 0.8
-    judgement = judged_by_positions(claims, end.steady_positions, half.antenna, noise=half.noise)
+    assert found.has_pose.mean() > 0.8
+    judgement = judged_by_positions(found, end.steady_positions, half.antenna, noise=half.noise)
     assert judgement.rms < 2.5 and judgement.wrong == 0 and judgement.count > 20
     nowhere, _ = localized(end, half.with_map(tmp_path, mirrored=True), tmp_path / "mirrored.lcm")
     assert not nowhere.has_pose.any()
 
 
-def test_steering_and_wheels_alone_follow_the_real_path():
+@pytest.mark.slow
+def test_few_trees_are_enough_on_a_part_of_the_real_drive(drive, half):
+    """With two landmarks in a scan. The whole: python -m vtbdrake_diagrams.park.few_landmarks."""
+    begin = drive.between(0.0, 195.0)  # Few scans tie the end of the survey down.
+    _, scans = thinned(begin, half.mapped, half.scenario, seed=0, trees=30)
+    assert np.median([len(scan) for scan in scans]) == 2.0
+    told = claims(begin, half.mapped, half.scenario, Case(), seed=0, trees=30)
+    assert told.available > 0.5 and told.wrong == 0 and told.within(0.5) < 0.2
+    nowhere = claims(begin, half.mapped, half.scenario, Case(is_mirrored=True), seed=0, trees=30)
+    assert nowhere.available == 0.0
+
+
+def test_steering_and_wheels_alone_follow_the_real_path(drive):
     """The odometry in the second half, calibrated in the first: over 25 s it keeps to the positions within a metre."""
-    drive = victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
     car = replace(ParkScenario().car, steering_scale=1.0445, steering_offset=0.0044)
     distances = []
     for start in np.arange(775.0, 1500.0, 25.0):
