@@ -29,7 +29,7 @@ from vtbdrake_diagrams.park.scenario import ParkScenario, car
 from vtbdrake_diagrams.park.survey import Survey
 from vtbdrake_diagrams.park.world import tree_model
 
-# The number of trees on the map: so many that a scan shows two in the median.
+# The number of trees on the map; with 90, a scan shows two in the median.
 _TREES = 90
 # Standard deviation of the errors of the map, per axis, in m.
 _DEVIATION = 0.1
@@ -108,16 +108,16 @@ def thinned(
         trees: The number of trees that are left.
     """
     random = np.random.default_rng(seed)
-    kept = random.permutation(len(whole.trees))[:trees]
-    is_kept = np.isin(np.arange(len(whole.trees)), kept)
+    left = random.permutation(len(whole.trees))[:trees]
+    is_left = np.isin(np.arange(len(whole.trees)), left)
     tree, scans = cKDTree(whole.trees.positions), []
     detected = drive.log.sense["trees"]
     for pose, row in zip(_poses_at(whole, detected.times), detected.values, strict=True):
         scan = range_bearing_landmarks(row, scenario.detector)
-        distances, nearest = tree.query(transform(pose, scan.positions)) if len(scan) else (np.zeros(0), kept[:0])
+        distances, nearest = tree.query(transform(pose, scan.positions)) if len(scan) else (np.zeros(0), left[:0])
         is_other = random.random(len(scan)) < _OTHERS
-        scans.append(scan.select(np.flatnonzero(np.where(distances < _MATCHES, is_kept[nearest], is_other))))
-    return kept, scans
+        scans.append(scan.select(np.flatnonzero(np.where(distances < _MATCHES, is_left[nearest], is_other))))
+    return left, scans
 
 
 def claims(
@@ -133,8 +133,8 @@ def claims(
         seed: Determines trees, detections and errors of the map.
         trees: The number of trees that are left.
     """
-    kept, scans = thinned(drive, whole, scenario, seed=seed, trees=trees)
-    true = whole.trees.select(kept)
+    left, scans = thinned(drive, whole, scenario, seed=seed, trees=trees)
+    true = whole.trees.select(left)
     errors = np.random.default_rng([seed, 1]).normal(size=true.positions.shape) * _DEVIATION
     mapped = replace(
         true,
@@ -173,10 +173,10 @@ def report(drive: Drive, seeds: Sequence[int]) -> str:
             [
                 f"{case.deviation:g} m" + ", mirrored" * case.is_mirrored,
                 "calibrated" if case.is_calibrated else "published",
-                ", ".join(f"{100.0 * one.available:.0f} %" for one in draws),
-                ", ".join(str(one.wrong) for one in draws),
-                ", ".join(f"{one.within(0.5):.2f}" for one in draws),
-                ", ".join(f"{one.within(0.99):.2f}" for one in draws),
+                ", ".join(f"{100.0 * draw.available:.0f} %" for draw in draws),
+                ", ".join(str(draw.wrong) for draw in draws),
+                ", ".join(f"{draw.within(0.5):.2f}" for draw in draws),
+                ", ".join(f"{draw.within(0.99):.2f}" for draw in draws),
             ]
         )
     return table(["deviation told", "steering", "scans with a pose", "wrong", "median, m", "99 %, m"], rows)
