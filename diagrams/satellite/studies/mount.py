@@ -340,7 +340,9 @@ class Onlooker:
         errors = []
         for k in range(1, len(rollout.times)):
             X_WB, X_WT = (
-                pose_from_array(pose_later(*(rollout.record[f"{body}.{v}"][k] for v in ("pose", "velocity")), age))
+                pose_from_array(
+                    pose_later(rollout.record[f"{body}.pose"][k], rollout.record[f"{body}.velocity"][k], age)
+                )
                 for body in _BODIES
             )
             X_CT = (X_WB @ X_BC).InvertAndCompose(X_WT)
