@@ -68,6 +68,17 @@ SOLVERS: dict[str, dict[str, Any]] = {
 }
 
 
+def discrete(time_step: float = 0.005) -> dict[str, Any]:
+    """Return fields of the scenario for a plant with steps (s) that SAP solves, so that its testbed can be compiled."""
+    plant_config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="point",
+        discrete_contact_approximation="sap",
+        use_sampled_output_ports=False,
+    )
+    return {"plant_config": plant_config, "simulator_config": SimulatorConfig()}
+
+
 def tipped_over(pitch: float) -> float:
     """Return f of the paper: 0 while the pitch (rad) is within 45 deg, else 1."""
     return 0.0 if abs(pitch) < np.pi / 4 else 1.0
