@@ -22,8 +22,8 @@ from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers import make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 
-METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "COBYQA", "grid", "random")
-# Methods that take a second or more for a decision: only by name, and with fewer seeds.
+METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "COBYQA", "auto", "grid", "random")
+# Methods that take long for a decision: fewer seeds.
 SLOW = ("auto", "bayesian", "COBYQA")
 SEEDS = 15
 SEEDS_OF_SLOW = 3
