@@ -4,24 +4,27 @@
 
 The survey of the whole drive has all trees. Some of them are drawn and are the map, each with an error of 0.1 m; only
 their detections are left, and a tenth of all others, which show nothing on the map. The unit goes along the whole drive
-without a guess. The survey, which uses all detections together, also later ones, judges each claim.
+without a guess. The survey, which uses all detections together, also later ones, judges each claim, but for ten seconds
+after it jumps against the wheels: there it contradicts itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import transform
+from vtbdrake.components.localization.planar import compose, inverse, transform
 from vtbdrake.components.localization.range_bearing import range_bearing_landmarks
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake_diagrams.park.reality import Drive, prepared, reckoned, surveyed, victoria_park
@@ -37,6 +40,10 @@ _DEVIATION = 0.1
 _OTHERS = 0.1
 # A detection shows a tree within this distance, in m.
 _MATCHES = 1.0
+# The survey jumps if its motion from scan to scan differs from dead reckoning's by more than this distance, in m.
+_JUMP = 0.5
+# For this time after a jump the survey does not judge, in s.
+_AFTER_JUMP = 10.0
 # A claim is wrong if it is off by more than this distance in m, and by more than three of its deviations.
 _WRONG = 0.5
 
@@ -74,10 +81,12 @@ class Claims:
     Attributes:
         errors: Distances of the claimed positions from the survey's in m, (n,); NaN without a pose.
         deviations: The claimed standard deviations of these distances in m, (n,); infinite without a pose.
+        is_judged: Whether the survey judges, (n,).
     """
 
     errors: Array
     deviations: Array
+    is_judged: NDArray[np.bool_]
 
     @property
     def available(self) -> float:
@@ -87,11 +96,11 @@ class Claims:
     @property
     def wrong(self) -> int:
         """Return the number of claims that are off by more than 0.5 m and three deviations."""
-        return int(((self.errors > _WRONG) & (self.errors > 3.0 * self.deviations)).sum())
+        return int((self.is_judged & (self.errors > _WRONG) & (self.errors > 3.0 * self.deviations)).sum())
 
     def within(self, share: float) -> float:
         """Return the error in m that a share of the claims does not exceed; NaN without claims."""
-        claimed = self.errors[np.isfinite(self.errors)]
+        claimed = self.errors[np.isfinite(self.errors) & self.is_judged]
         return float(np.quantile(claimed, share)) if len(claimed) else float("nan")
 
 
@@ -153,7 +162,19 @@ def claims(
     claimed = np.array([answer.pose[:2] for answer in answers])
     off = np.hypot(*(claimed - _poses_at(whole, times)[:, :2]).T)
     deviations = np.sqrt([np.trace(answer.covariance[:2, :2]) for answer in answers])
-    return Claims(np.where(is_claimed, off, np.nan), deviations)
+    return Claims(np.where(is_claimed, off, np.nan), deviations, _judges(whole, drive, scenario, times))
+
+
+def _judges(whole: Survey, drive: Drive, scenario: ParkScenario, times: Array) -> NDArray[np.bool_]:
+    """Return whether the survey has not jumped within the last seconds before each scan, (n,)."""
+    truth, wheels = _poses_at(whole, times), reckoned(drive.log.sense["odometry"], scenario.car, times)
+    ways = [
+        np.array([compose(inverse(before), after)[:2] for before, after in pairwise(poses)])
+        for poses in (truth, wheels)
+    ]
+    jumps = times[1:][np.hypot(*(ways[0] - ways[1]).T) > _JUMP]
+    after = times[:, None] - jumps
+    return ~((after >= 0.0) & (after < _AFTER_JUMP)).any(axis=1)
 
 
 def _poses_at(whole: Survey, times: Array) -> Array:
@@ -175,11 +196,13 @@ def report(drive: Drive, seeds: Sequence[int]) -> str:
                 "calibrated" if case.is_calibrated else "published",
                 ", ".join(f"{100.0 * draw.available:.0f} %" for draw in draws),
                 ", ".join(str(draw.wrong) for draw in draws),
+                ", ".join(str(int(np.isfinite(draw.errors[draw.is_judged]).sum())) for draw in draws),
                 ", ".join(f"{draw.within(0.5):.2f}" for draw in draws),
                 ", ".join(f"{draw.within(0.99):.2f}" for draw in draws),
             ]
         )
-    return table(["deviation told", "steering", "scans with a pose", "wrong", "median, m", "99 %, m"], rows)
+    header = ["deviation told", "steering", "scans with a pose", "wrong", "judged", "median, m", "99 %, m"]
+    return table(header, rows)
 
 
 @click.command()

@@ -261,7 +261,8 @@ def test_state_that_is_updated_otherwise_is_named(events: dict) -> None:
 
 def test_an_end_of_the_simulation_is_noticed() -> None:
     assert compiled(alone(Counter_[float](periods=(0.1,))), ("part0.x",))().outputs["part0.x"][0, -1] == 10.0
-    with pytest.raises(CompiledDifferenceError, match="ends its simulation, which is not compiled: .*that is enough"):
+    message = "ends its simulation, and what is compiled does not: .*that is enough"
+    with pytest.raises(CompiledDifferenceError, match=message):
         compiled(alone(Counter_[float](periods=(0.1,), most=3.0)))
 
 

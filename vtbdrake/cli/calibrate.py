@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
@@ -22,11 +21,11 @@ from vtbdrake.cli.options import (
     settings,
 )
 from vtbdrake.cli.output import json_option, show
-from vtbdrake.common.arrays import Array
 from vtbdrake.machine.config import MachineConfig
 
 if TYPE_CHECKING:
     from vtbdrake.calibration import SelfTest
+    from vtbdrake.common.arrays import Array
     from vtbdrake.optimization import Parameter
     from vtbdrake.recording import Log
     from vtbdrake.testbed import Scenario
@@ -50,6 +49,8 @@ def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[
     """
     if _ALL_DRIVES not in parameters:
         return list(parameters)
+    import numpy as np
+
     from vtbdrake.optimization import Parameter
 
     addresses = [address for address in scenario.build().variables() if address.startswith("sim.act.")]
