@@ -140,7 +140,7 @@ def _slopes(point: _Point, k: int) -> np.ndarray:
             step[k] = sign * size * max(1.0, abs(point.x[k]))
             slopes.append((_values(point, point.x + step) - here) / step[k])
     mean = np.mean(slopes[:2], axis=0)
-    return np.where(np.isclose(slopes, mean, rtol=1e-3, atol=1e-3).all(axis=0), mean, np.nan)
+    return np.where(np.isclose(slopes, mean, rtol=1e-3, atol=_TOLERANCE).all(axis=0), mean, np.nan)
 
 
 def _values(point: _Point, x: np.ndarray) -> np.ndarray:
