@@ -35,7 +35,7 @@ def test_missing_file_names_its_remedy(tmp_path: Path) -> None:
         read_results(tmp_path / "kept.json")
 
 
-@pytest.mark.parametrize("study", ["mount"])
+@pytest.mark.parametrize("study", ["mount", "scan_frequency"])
 def test_results_of_the_studies_have_their_digest(study: str) -> None:
     folder = Path(__file__).resolve().parents[2] / "diagrams/satellite/studies"
     assert read_results(folder / f"{study}.json")
