@@ -364,7 +364,7 @@ class FrequencyAnswer:
         """Return the window of frequencies that suffice at all tumble rates, with de-skewed scans."""
         windows = [self.window(DESKEWED, tumble) for tumble in self.tumbles]
         lower, upper = (np.array([getattr(w, end) for w in windows]) for end in ("lower", "upper"))
-        return Window(tuple(lower.max(axis=0).tolist()), tuple(upper.min(axis=0).tolist()))  # type: ignore[arg-type]
+        return Window(tuple(lower.max(axis=0).tolist()), tuple(upper.min(axis=0).tolist()))
 
     @property
     def follows(self) -> bool:
@@ -410,14 +410,14 @@ def skew(frequency: ArrayLike) -> Array:
 
 def read_answer(path: Path = RESULTS) -> FrequencyAnswer:
     """Return the kept results."""
-    kept = read_results(path)
+    results = read_results(path)
     errors = {
         (row["scans"], row["tumble_deg"], row["frequency"]): [inf if e is None else e for e in row["errors"]]
-        for row in kept["approaches"]
+        for row in results["approaches"]
     }
     captures = [
         GuidedCaptures(row["frequency"], *(np.array(row[k], dtype=float) for k in ("times", "errors")))
-        for row in kept["captures"]
+        for row in results["captures"]
     ]
     return FrequencyAnswer(errors, tuple(captures))
 
@@ -445,7 +445,7 @@ def next_block(errors: Mapping[Key, Sequence[float]]) -> tuple[Key, tuple[int, .
     def urgency(key: Key) -> tuple[int, int]:
         done, raw = errors.get(key, ()), 2 * (key[0] == RAW)
         if not done:
-            return raw, 0
+            return 0, raw
         lower, _, upper = quantile_bounds(done)
         return (1 + raw if lower < TOLERANCE < upper else 4), len(done)
 
@@ -534,14 +534,14 @@ def compare_again(answer: FrequencyAnswer, count: int = RERUN) -> list[tuple[Key
     return draws
 
 
-def agree(kept: float, now: float) -> bool:
+def agree(before: float, now: float) -> bool:
     """Return whether two errors of the same approach, in m, are the same but for rounding on another processor.
 
     A track that is lost ends anywhere: of two errors far above the tolerance nothing more is compared.
     """
-    if min(kept, now) > 3.0 * TOLERANCE:
+    if min(before, now) > 3.0 * TOLERANCE:
         return True
-    return abs(kept - now) < 0.1 * TOLERANCE
+    return abs(before - now) < 0.1 * TOLERANCE
 
 
 # -- pictures and words
@@ -616,20 +616,23 @@ def frequency(full: bool) -> Answer:
         cases=f"at least {result.fewest} approaches with each of {len(result.errors)} kinds of scans, tumble rates and "
         "frequencies",
         held_out="",
-        baseline=f"the same scans, raw: {_range(*_shared_raw(result))}",
+        baseline=f"the same scans, raw: {_shared_raw(result)}",
         refused=len(no_window),
         holds=result.holds and same,
         note=f"Frequencies for which the error at the bar is below {1e3 * TOLERANCE:.1f} mm in {QUANTILE:.0%} of the "
         f"approaches, with confidence {CONFIDENCE:.0%}; the interval's ends surely do not suffice. {windows}. "
-        f"{_not_shown(result)}{_capture_words(result)} "
+        f"{_not_shown(result)}{_capture_words(result)}"
         + "; ".join(f"{claim}: {'yes' if true else 'NO'}" for claim, true in claims.items())
         + ".",
     )
 
 
-def _shared_raw(answer: FrequencyAnswer) -> tuple[float, float]:
+def _shared_raw(answer: FrequencyAnswer) -> str:
+    """Return in words which frequencies suffice at all tumble rates with raw scans."""
     windows = [answer.window(RAW, tumble) for tumble in answer.tumbles]
-    return max(w.lower[1] for w in windows), min(w.upper[1] for w in windows)
+    first, last = (np.array([getattr(w, end)[1] for w in windows]) for end in ("lower", "upper"))
+    suffices = first.max() <= last.min()  # False if an end is NaN.
+    return _range(float(first.max()), float(last.min())) if suffices else "no frequency suffices"
 
 
 def _not_shown(answer: FrequencyAnswer) -> str:
@@ -648,7 +651,7 @@ def _capture_words(answer: FrequencyAnswer) -> str:
         + (f", {1e3 * np.nanmax(c.errors):.1f} mm off at most" if (c.times < FAILURE).any() else "")
         for c in answer.captures
     ]
-    return f"Captures guided by the scanner alone at {TUMBLES[0]:g} deg/s: {'; '.join(rows)}." if rows else ""
+    return f"Captures guided by the scanner alone at {TUMBLES[0]:g} deg/s: {'; '.join(rows)}. " if rows else ""
 
 
 @click.command()
