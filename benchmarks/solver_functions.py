@@ -15,7 +15,9 @@ from functools import cache
 
 import numpy as np
 
-SMOOTH, MULTIMODAL, ROUGH = "smooth", "multimodal", "rough"
+SMOOTH = "smooth"
+MULTIMODAL = "multimodal"
+ROUGH = "rough"
 
 
 @dataclass(frozen=True)

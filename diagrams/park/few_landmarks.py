@@ -50,7 +50,7 @@ _WRONG = 0.5
 
 @dataclass(frozen=True)
 class Case:
-    """What the unit is told.
+    """The errors that the unit is told of its map, and the steering.
 
     Attributes:
         deviation: Standard deviation of the map's errors, per axis, in m; the true one is 0.1.
@@ -76,7 +76,7 @@ CASES = (
 
 @dataclass(frozen=True, eq=False)
 class Claims:
-    """What the unit claims, scan by scan.
+    """The errors and deviations of what the unit claims, scan by scan.
 
     Attributes:
         errors: Distances of the claimed positions from the survey's in m, (n,); NaN without a pose.

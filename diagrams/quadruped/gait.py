@@ -17,7 +17,7 @@ OFFSETS = (
     "roll",
     "pitch",
 )
-"""What is added to the trot: to the feet of a diagonal pair (m), and to the height of all feet (rad)."""
+"""The offsets that are added to the trot: to the feet of a diagonal pair (m), and to the height of all feet (rad)."""
 
 # The legs of the diagonal pair that swings first.
 _FIRST = ("front_left", "hind_right")

@@ -62,9 +62,8 @@ def compare(rollouts: CompiledRollouts, begin: Context, *, updates: int = _MOST_
     """Compare one rollout from a root context with Drake's, and return the largest difference after one step.
 
     Each step begins with Drake's state; `Equations.agreement` tells how near it must come, unless rounding decides the
-    step. Beside that, what the whole
-    rollout records is compared, loosely: in a fast or chaotic testbed, rounding grows. It is not compared where a step
-    with contact is as good as its iteration.
+    step. Beside that, what the whole rollout records is compared, loosely: in a fast or chaotic testbed, rounding
+    grows. It is not compared where a step with contact is as good as its iteration.
 
     Args:
         rollouts: The compiled Diagram.

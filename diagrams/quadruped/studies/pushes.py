@@ -1,4 +1,4 @@
-"""How hard may the quadruped be pushed? With a reasoner on board that replans its steps, and without.
+"""The quadruped is pushed, with a reasoner on board that replans its steps, and without: how often does it fall?
 
 ``python -m vtbdrake_diagrams.quadruped.studies.pushes [--pushes N] [--sizes J ...]`` prints the shares of falls.
 """
@@ -92,7 +92,7 @@ def has_fallen(state: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class Shares:
-    """How often the robot fell.
+    """The shares of pushes after which the robot fell.
 
     Attributes:
         impulse: Impulse of the pushes in N s.

@@ -44,7 +44,7 @@ from pydrake.systems.framework import Diagram
 
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
-from vtbdrake.rollout import Executor, ProcessExecutor
+from vtbdrake.rollout import Executor, ProcessExecutor, RolloutRunner, RolloutTask
 from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.visualization.plots import Picture, finish
 from vtbdrake.visualization.study_plots import BEST
@@ -205,6 +205,35 @@ def bar_error(record: Mapping[str, Any]) -> float:
     base, target, relative = (record[address][-1] for address in RECORDED)
     X_BT = pose_from_array(base).InvertAndCompose(pose_from_array(target))
     return float(np.linalg.norm(X_BT @ Target().X_TH.translation() - Relative(relative).p_BH))
+
+
+def guided_grips(
+    scenario: SatelliteScenario, starts: Sequence[Mapping[str, Any]], *, horizon: float
+) -> tuple[Array, Array]:
+    """Simulate captures from some starts.
+
+    Args:
+        scenario: The satellite, with what guides it.
+        starts: The values of the starts by address.
+        horizon: How long a capture may take, in s.
+
+    Returns:
+        When the fingers held the bar, in s, `FAILURE` if they never did, and how far the bar was from where the DPS
+        believed it then, in m, NaN without success; both of shape (starts,).
+    """
+    task = RolloutTask(
+        scenario=scenario,
+        horizon=horizon,
+        quality=vtb.Quality(time_to_grip, of=["dps.impl.supervisor.mode", "dps.env.base.time"], minimize=True),
+        threshold=FAILURE,
+        sample_period=0.2,
+        record=RECORDED,
+    )
+    runner = RolloutRunner(task, scenario.build())
+    rollouts = [runner.run(start) for start in starts]
+    times = [FAILURE if rollout.failed else rollout.value for rollout in rollouts]
+    errors = [bar_error(r.record) if t < FAILURE else np.nan for r, t in zip(rollouts, times, strict=True)]
+    return np.array(times), np.array(errors)
 
 
 @dataclass(frozen=True)

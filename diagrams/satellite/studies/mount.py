@@ -40,7 +40,7 @@ from scipy.stats import t as student
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.perception.markers import detect_markers, pose_from_markers
-from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
+from vtbdrake.rollout import RolloutResult, RolloutRunner
 from vtbdrake.state import NamedVector, Quantity
 from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
@@ -51,7 +51,7 @@ from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.perception import target_board
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
-from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, RECORDED, bar_error, time_to_grip
+from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, guided_grips
 
 POSE = "sim.sense.docking_camera.pose"
 _ENTRIES = NamedVector(
@@ -77,11 +77,11 @@ TUMBLES = (0.5, 1.0, 1.5, 2.0, 3.0)
 TELLING = 0.3
 """The least difference of mean counts that means anything, in markers."""
 GLOBAL = 10
-"""How many placements the default solver tries, beside those by hand."""
+"""The number of placements that the default solver tries, beside those by hand."""
 LOCAL = 14
-"""How many COBYLA tries after them."""
+"""The number of placements that COBYLA tries after them."""
 GUIDED = 5
-"""How many of `JUDGED_ON` the cameras guide."""
+"""The number of captures of `JUDGED_ON` that the cameras guide."""
 GUIDED_HORIZON = 36.0
 """How long a capture that the camera guides may take, in s."""
 GUIDED_RATE = 2.5
@@ -377,19 +377,7 @@ class Guided:
 def guide(value: Array, on: Sequence[Capture]) -> Guided:
     """Simulate captures that a camera with this pose guides, alone and without wheels."""
     guided = SatelliteScenario(perception="camera", camera_fps=GUIDED_RATE, camera_pose=value.tolist())
-    task = RolloutTask(
-        scenario=guided,
-        horizon=GUIDED_HORIZON,
-        quality=vtb.Quality(time_to_grip, of=["dps.impl.supervisor.mode", "dps.env.base.time"], minimize=True),
-        threshold=FAILURE,
-        sample_period=0.2,
-        record=RECORDED,
-    )
-    runner = RolloutRunner(task, guided.build())
-    rollouts = [runner.run(capture.values()) for capture in on]
-    times = [FAILURE if rollout.failed else rollout.value for rollout in rollouts]
-    errors = [bar_error(r.record) if t < FAILURE else np.nan for r, t in zip(rollouts, times, strict=True)]
-    return Guided(np.array(times), np.array(errors))
+    return Guided(*guided_grips(guided, [capture.values() for capture in on], horizon=GUIDED_HORIZON))
 
 
 # -- the campaign

@@ -40,7 +40,7 @@ from vtbdrake.common.settings import setting
 from vtbdrake.components.perception.target_tracker import TargetTracker
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScannerConfig, connect_laser_scanner
-from vtbdrake.rollout import Executor, ProcessExecutor, RolloutRunner, RolloutTask
+from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.visualization.plots import Picture, finish
@@ -53,7 +53,7 @@ from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_scan_pa
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target, plant_config
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import Release, Start, random_start
-from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, RECORDED, bar_error, time_to_grip
+from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, guided_grips
 
 APPROACH = 16.0
 """How long the approach takes, in s."""
@@ -471,21 +471,9 @@ def guide(frequency: float, seeds: Sequence[int] = CAPTURE_SEEDS) -> GuidedCaptu
     """
     scanner = replace(SCANNER, frequency=frequency)
     scenario = SatelliteScenario(perception="scanner", wheels=True, tumble_deg=TUMBLES[0], scanner=scanner)
-    task = RolloutTask(
-        scenario=scenario,
-        horizon=CAPTURE_HORIZON,
-        quality=vtb.Quality(time_to_grip, of=["dps.impl.supervisor.mode", "dps.env.base.time"], minimize=True),
-        threshold=FAILURE,
-        sample_period=0.2,
-        record=RECORDED,
-    )
-    runner = RolloutRunner(task, scenario.build())
     tumble = radians(scenario.tumble_deg)
     starts = [random_start(seed, tumble=tumble, distance=scenario.distance).values() for seed in seeds]
-    rollouts = [runner.run(start) for start in starts]
-    times = [FAILURE if rollout.failed else rollout.value for rollout in rollouts]
-    errors = [bar_error(r.record) if t < FAILURE else nan for r, t in zip(rollouts, times, strict=True)]
-    return GuidedCaptures(frequency, np.array(times), np.array(errors))
+    return GuidedCaptures(frequency, *guided_grips(scenario, starts, horizon=CAPTURE_HORIZON))
 
 
 def continue_campaign(
