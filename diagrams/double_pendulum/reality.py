@@ -63,6 +63,8 @@ _LARGE_ERROR = 0.03
 _EVALUATIONS = 12
 
 Derivative = Callable[[Array, Array], Array]
+Prediction = Callable[[Array, Array, Array], Array]
+"""A function of states at the begin (w, 4), times (w, n) in s and torques (w, n, 2) -> positions (w, n, 2)."""
 
 
 def recordings(folder: Path) -> list[Log]:
@@ -215,32 +217,46 @@ def published(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def published_model(p: dict[str, float]) -> Derivative:
-    """Return the equation of motion of the authors' software, (x, tau) -> xdot, with its law of friction."""
+    """Return the equation of motion of the authors' software with its law of friction, (x (4, w), tau (2, w)) -> xdot.
+
+    Each of the w columns is a motion of its own.
+    """
 
     def derivative(x: Array, tau: Array) -> Array:
         q1, q2, v1, v2 = x
         c2, s2, l1, gear = np.cos(q2), np.sin(q2), p["l1"], p["gr"]
         first, second = p["m1"] * p["r1"], p["m2"] * p["r2"]
+        upper = p["I1"] + p["I2"] + p["m2"] * l1**2 + 2.0 * l1 * second * c2 + (gear**2 + 1.0) * p["Ir"]
         coupling = p["I2"] + l1 * second * c2 - gear * p["Ir"]
-        M = np.array(
-            [
-                [p["I1"] + p["I2"] + p["m2"] * l1**2 + 2.0 * l1 * second * c2 + (gear**2 + 1.0) * p["Ir"], coupling],
-                [coupling, p["I2"] + gear**2 * p["Ir"]],
-            ]
-        )
+        lower = p["I2"] + gear**2 * p["Ir"]
         bias = l1 * second * s2 * np.array([-2.0 * v1 * v2 - v2**2, v1**2])
         end = second * np.sin(q1 + q2)
         weight = -p["g"] * np.array([(first + p["m2"] * l1) * np.sin(q1) + end, end])
-        friction = np.array([p["b1"], p["b2"]]) * x[2:] + np.array([p["cf1"], p["cf2"]]) * np.arctan(100.0 * x[2:])
-        return np.concatenate([x[2:], np.linalg.solve(M, tau - bias + weight - friction)])
+        viscous, coulomb = (np.array([[p[f"{kind}1"]], [p[f"{kind}2"]]]) for kind in ("b", "cf"))
+        f1, f2 = tau - bias + weight - viscous * x[2:] - coulomb * np.arctan(100.0 * x[2:])
+        determinant = upper * lower - coupling**2
+        return np.array(
+            [v1, v2, (lower * f1 - coupling * f2) / determinant, (upper * f2 - coupling * f1) / determinant]
+        )
 
     return derivative
 
 
-def published_prediction(p: dict[str, float], x: Array, times: Array, torques: Array) -> Array:
-    """Return the positions (n, 2) that a published model predicts from the state x (4,), by Runge-Kutta steps."""
-    derivative, positions = published_model(p), [x[:2]]
-    for h, tau in zip(np.diff(times), torques, strict=False):
+def published_predictions(p: dict[str, float], x: Array, times: Array, torques: Array) -> Array:
+    """Return the positions that a published model predicts by Runge-Kutta steps, all motions side by side.
+
+    Args:
+        p: The published parameters.
+        x: The states at the begin, (w, 4).
+        times: In s, (w, n).
+        torques: In N m, (w, n, 2); each acts until the next time.
+
+    Returns:
+        Shape (w, n, 2), in rad.
+    """
+    derivative, x = published_model(p), x.T
+    positions = [x[:2]]
+    for h, tau in zip(np.diff(times).T, np.moveaxis(torques, 0, 2), strict=False):
         for _ in range(_SUBSTEPS):
             step = h / _SUBSTEPS
             k1 = derivative(x, tau)
@@ -249,11 +265,13 @@ def published_prediction(p: dict[str, float], x: Array, times: Array, torques: A
             k4 = derivative(x + step * k3, tau)
             x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         positions.append(x[:2])
-    return np.array(positions)
+    return np.array(positions).transpose(2, 0, 1)
 
 
 class TestbedPrediction:
     """The positions that the testbed itself predicts, as a world that the log drives.
+
+    Called like `published_predictions`, without the parameters.
 
     Args:
         values: Values of variables by address.
@@ -266,6 +284,9 @@ class TestbedPrediction:
         self._values, self._start = dict(values), log.start
 
     def __call__(self, x: Array, times: Array, torques: Array) -> Array:
+        return np.array([self._prediction(*motion) for motion in zip(x, times, strict=True)])
+
+    def _prediction(self, x: Array, times: Array) -> Array:
         testbed = self._testbed
         context = testbed.default_context()
         testbed.write(context, self._values)
@@ -279,18 +300,16 @@ class TestbedPrediction:
         return np.array(positions)
 
 
-def prediction_errors(log: Log, predict: Callable[[Array, Array, Array], Array]) -> Array:
+def prediction_errors(log: Log, predict: Prediction) -> Array:
     """Return the root mean squares in rad of the errors of predictions over `HORIZON`, all along a recording.
 
     Args:
         log: The recording.
-        predict: A function of the state (4,) at the begin, times (n,) in s and torques (n, 2) -> positions (n, 2).
+        predict: Predicts the motions.
     """
     recording = JointRecording.of(log, JointModel(DoublePendulumScenario().build()), position=POSITION, torque=TORQUE)
-    errors = []
-    for x, times, torques, positions in _windows(recording):
-        errors.append(np.sqrt(np.mean((predict(x, times, torques) - positions) ** 2)))
-    return np.array(errors)
+    x, times, torques, positions = (np.stack(parts) for parts in zip(*_windows(recording), strict=True))
+    return np.sqrt(np.mean((predict(x, times, torques) - positions) ** 2, axis=(1, 2)))
 
 
 def _windows(recording: JointRecording) -> list[tuple[Array, Array, Array, Array]]:
@@ -323,10 +342,10 @@ def main(folder: Path) -> None:
         rows[name] = {"m1 r1 + m2 l1": p["m1"] * p["r1"] + p["m2"] * p["l1"], "m2 r2": p["m2"] * p["r2"], "I2": p["I2"]}
     for name, row in rows.items():
         print(f"{name:12}" + "".join(f"{value:16.4f}" for value in row.values()))
-    predictions: dict[str, Callable[[Log], Callable[..., Array]]] = {
+    predictions: dict[str, Callable[[Log], Prediction]] = {
         "predictions": lambda log: TestbedPrediction(predicting, log),
         "calibrated": lambda log: TestbedPrediction(values, log),
-        **{name: lambda log, p=p: partial(published_prediction, p) for name, p in sets.items()},  # type: ignore[misc]
+        **{name: lambda log, p=p: partial(published_predictions, p) for name, p in sets.items()},  # type: ignore[misc]
     }
     for text, runs in ((f"{len(held_out)} runs that were not fitted", held_out), ("swing-ups", swing_ups(folder))):
         print(f"\nRMS error in rad of predictions over {HORIZON:g} s, {text}:")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -208,6 +210,6 @@ def test_real_double_pendulum_is_predicted_better_than_by_the_published_models()
         ours = np.concatenate([reality.prediction_errors(r, reality.TestbedPrediction(predicting, r)) for r in runs])
         for name, p in reality.published(folder).items():
             theirs = np.concatenate(
-                [reality.prediction_errors(r, lambda *a, p=p: reality.published_prediction(p, *a)) for r in runs]
+                [reality.prediction_errors(r, partial(reality.published_predictions, p)) for r in runs]
             )
             assert np.median(ours) < np.median(theirs), name

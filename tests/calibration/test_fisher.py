@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.optimize
-import scipy.signal
-import scipy.stats
+import scipy
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, TRUTH, VALUES, VISCOUS, calibrated

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
+import scipy
 from playwright.sync_api import Browser
 
 from tests.chromium import needs_chromium, screenshot

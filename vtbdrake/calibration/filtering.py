@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
-import scipy.linalg
-import scipy.signal
+import scipy
 from numpy.typing import NDArray
 
 from vtbdrake.calibration.joint_model import CalibrationError, JointModel

@@ -14,7 +14,7 @@ from typing import Any
 
 import casadi
 import numpy as np
-import scipy.signal
+import scipy
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 

@@ -19,9 +19,7 @@ from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
-import scipy.linalg
-import scipy.signal
-import scipy.stats
+import scipy
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.systems.framework import Context

@@ -11,8 +11,7 @@ from math import acos, hypot, inf, isnan, nan, pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.signal
-import scipy.stats
+import scipy
 
 from vtbdrake import upper_layers
 from vtbdrake.common.argument_checks import suggestion
