@@ -9,7 +9,7 @@ parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import casadi
@@ -21,6 +21,7 @@ import yaml
 import vtbdrake as vtb
 from vtbdrake.calibration import Calibration, JointModel, JointRecording, calibrate
 from vtbdrake.common.arrays import Array
+from vtbdrake.components.casadi_system.compiler import compiled_if_possible
 from vtbdrake.recording import DrivenScenario, Log
 from vtbdrake_diagrams.double_pendulum.scenario import JOINTS, LINKS, DoublePendulumScenario
 
@@ -155,14 +156,17 @@ def fitted_to_predictions(logs: Sequence[Log], start: Mapping[str, float]) -> di
     x, m, h, z = model.step.sx_in()
     following = model.step(x, m, h, z)
     parts = [following, casadi.jacobian(following, x), casadi.jacobian(following, z)]
-    step = casadi.Function("prediction_step", [x, m, h, z], [casadi.densify(casadi.horzcat(*parts))]).map(len(x0))
+    step = casadi.Function("prediction_step", [x, m, h, z], [casadi.densify(casadi.horzcat(*parts))])
+    step_of_all = compiled_if_possible(step).map(len(x0))
 
-    def residuals(values: Array) -> tuple[Array, Array]:
+    @lru_cache(maxsize=1)  # The solver asks for the errors and, at the same values, for their slopes.
+    def residuals(key: bytes) -> tuple[Array, Array]:
+        values = np.frombuffer(key)
         state, slope = x0, np.zeros((len(x0), 4, len(values)))
         errors, slopes, at = [], [], np.tile(values[:, np.newaxis], len(x0))
         for k in range(len(steps)):
             for _ in range(_SUBSTEPS):
-                table = step(state.T, torques[k].T, steps[k][np.newaxis] / _SUBSTEPS, at)
+                table = step_of_all(state.T, torques[k].T, steps[k][np.newaxis] / _SUBSTEPS, at)
                 following = np.asarray(table).reshape(4, len(x0), -1).swapaxes(0, 1)
                 state, slope = following[..., 0], following[..., 1:5] @ slope + following[..., 5:]
             if k % _STRIDE == 0:
@@ -171,9 +175,9 @@ def fitted_to_predictions(logs: Sequence[Log], start: Mapping[str, float]) -> di
         return np.ravel(errors), np.reshape(slopes, (-1, len(values)))
 
     fit = scipy.optimize.least_squares(
-        lambda values: residuals(values)[0],
+        lambda values: residuals(values.tobytes())[0],
         np.clip([begin[name] for name in model.names], model.lower + 1e-9, model.upper),
-        jac=lambda values: residuals(values)[1],
+        jac=lambda values: residuals(values.tobytes())[1],
         bounds=(model.lower, model.upper),
         x_scale=model.scales,
         loss="soft_l1",
