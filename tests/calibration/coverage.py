@@ -43,7 +43,7 @@ def main() -> None:
     """Print the coverage over 26 recordings and 4 parameters, of all and of the accepted ones."""
     for kind in sys.argv[1:] or ROWS:
         for text, log_of in ROWS[kind].items():
-            results = [calibrated(log_of(seed)) for seed in SEEDS]
+            results = [calibrated(log_of(seed), segment=1.0) for seed in SEEDS]
             pairs = [(r.accepted, r.parameters[address], value) for r in results for address, value in VALUES.items()]
             inside = np.array([each.lower <= value <= each.upper for _, each, value in pairs])
             accepted = np.array([is_accepted for is_accepted, _, _ in pairs])

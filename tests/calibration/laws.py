@@ -40,7 +40,7 @@ def row(law: str, disturbance: float) -> tuple[str, ...]:
     logs = [
         recorded(law if law in LAWS else "Coulomb", seed=seed, offset=offset, disturbance=disturbance) for seed in SEEDS
     ]
-    results = [calibrated(log) for log in logs]
+    results = [calibrated(log, segment=1.0) for log in logs]
     accepted = [result for result in results if result.accepted]
     named = sum(bool(CAUSES[law]) and CAUSES[law] in " ".join(result.reasons) for result in results)
     inside = [value for result in accepted for value in covered(result)]

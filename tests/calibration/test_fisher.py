@@ -166,7 +166,7 @@ def test_what_a_recording_will_tell_is_known_beforehand() -> None:
     log, names = recorded(TRUTH, 1, seconds=4.0), {"position": "position", "torque": "torque"}
     noise = Noise(np.array([2e-4]), np.array([3e-3]), 0.05)  # the drives represent friction by one number per period
     told = information(PendulumScenario(), log, PARAMETERS, noise=noise, **names)
-    result = calibrated(recorded(TRUTH, 1, seconds=4.0, noise_seed=8), noise=noise)
+    result = calibrated(recorded(TRUTH, 1, seconds=4.0, noise_seed=8), noise=noise, segment=1.0)
     ratios = np.array([each.deviation for each in result.parameters.values()]) / told.together
     # One of four segments is kept back, and the sandwich has few blocks.
     assert np.all((ratios > 0.9) & (ratios < 2.5)), (ratios, told)
@@ -180,7 +180,7 @@ def test_interval_at_a_bound_is_the_profile_of_the_likelihood() -> None:
     truth = {**TRUTH, VISCOUS: 0.0}
     for seed in range(40, 46):
         log = recorded(truth, seed, seconds=4.0)
-        result = calibrated(log)
+        result = calibrated(log, segment=1.0)
         viscous = result.parameters[VISCOUS]
         if viscous.verdict == Verdict.AT_BOUND:
             break

@@ -54,7 +54,9 @@ def of_double_pendulum(log: Log) -> object:
         Parameter(f"{LINKS}.upper.center_of_mass[2]", -0.3, -0.05),
         Parameter("sim.act.drives.coulomb[0]", 0.0, 0.5),
     ]
-    return calibrate(DoublePendulumScenario(), log, parameters, position="joint_position", torque="torque")
+    return calibrate(
+        DoublePendulumScenario(), log, parameters, position="joint_position", torque="torque", segment=0.25
+    )
 
 
 @pytest.mark.slow_cases
@@ -135,8 +137,8 @@ def test_torques_of_another_clock_are_mentioned() -> None:
     log = pendulum_log()
     u = log.act["torque"]
     late = Log("late.csv", log.sense, {"torque": Series(u.times - 0.032, u.values)})
-    assert not calibrated(log).remarks
-    result = calibrated(late)
+    assert not calibrated(log, segment=1.0).remarks
+    result = calibrated(late, segment=1.0)
     (remark,) = (each for each in result.remarks if "vary the delay" in each)
     assert remark.startswith("with torques that act 32 ms later"), remark
     assert not result.accepted

@@ -38,7 +38,7 @@ def test_right_law_is_accepted(seed: int) -> None:
     ],
 )
 def test_wrong_law_is_named(law: str, dependence: str) -> None:
-    result = calibrated(recorded(law, seed=20))
+    result = calibrated(recorded(law, seed=20), segment=1.0)
     assert {each.verdict for each in result.parameters.values()} == {Verdict.DISCREPANT}
     (reason,) = result.reasons
     assert reason.startswith(f"the torque of pivot depends on {dependence}")
@@ -61,7 +61,7 @@ def test_term_that_was_named_is_calibrated(law: str, term: str, truth: float) ->
 def test_with_stribecks_friction_the_rest_of_the_law_is_right() -> None:
     """Near rest the machine sticks, which smooth friction does not: so the term itself is not the machine's."""
     stribeck = [Parameter(f"{DRIVES}.stribeck[0]", 0.0, 0.5), Parameter(f"{DRIVES}.stribeck_velocity[0]", 0.05, 1.0)]
-    result = calibrated(recorded("Stribeck", seed=20), [*PARAMETERS, *stribeck])
+    result = calibrated(recorded("Stribeck", seed=20), [*PARAMETERS, *stribeck], segment=1.0)
     assert not [reason for reason in result.reasons if "depends on" in reason]
     assert result.parameters[COULOMB].value == pytest.approx(0.2, rel=0.05)
     assert result.parameters[VISCOUS].value == pytest.approx(0.03, rel=0.1)

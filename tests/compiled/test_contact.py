@@ -364,6 +364,7 @@ def test_other_shapes_are_refused_by_name() -> None:
         compiled(ball_on(Box(1.0, 1.0, 1.0), of_ball=Box(0.1, 0.1, 0.1))[0])
 
 
+@pytest.mark.slow
 def test_an_arm_presses_on_a_wall() -> None:
     """The whole testbed with sensors and DPS, and the reaction forces of its joints."""
     testbed = ManipulatorScenario(wall=True).build()

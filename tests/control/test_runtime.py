@@ -1011,8 +1011,12 @@ def test_interruption_dropped_by_pybind11_ends_the_loop(number):
                 raise TypeError("incompatible function arguments") from None
 
     runtime.watch(watch)
-    with pytest.raises(KeyboardInterrupt), ending_signals(signal.default_int_handler):
-        runtime.run(cycles=100)
+    before = signal.signal(number, signal.SIG_DFL)  # Under nohup, SIGHUP is ignored.
+    try:
+        with pytest.raises(KeyboardInterrupt), ending_signals(signal.default_int_handler):
+            runtime.run(cycles=100)
+    finally:
+        signal.signal(number, before)
     assert runtime.cycles == 6
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 

@@ -178,6 +178,7 @@ def test_other_robots_hold_move_and_drive_a_machine(
             assert tests["distance"](runtime.read("real.sense.position"), np.array(tests["AWAY"])) < tests["TOLERANCE"]
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_a_robot_with_legs_stands_on_them(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
     tests = module_of_tests(projects, "quadruped", monkeypatch)

@@ -82,15 +82,16 @@ def wanted_tip(run: Run, motion: int, t: float) -> np.ndarray:
     return run.tip_at(home) + 0.1 * np.array([0.0, np.sin(angle), 1 - np.cos(angle)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "motion", "tolerance"),
     [
         ("joint_impedance", Motion.SWING, 0.002),
-        pytest.param("cartesian_impedance", Motion.CIRCLE, 0.006, marks=pytest.mark.slow),
-        pytest.param("joint_impedance", Motion.CIRCLE, 0.002, marks=pytest.mark.slow),
-        pytest.param("cartesian_impedance", Motion.SWING, 0.006, marks=pytest.mark.slow),
-        pytest.param("admittance", Motion.SWING, 0.002, marks=pytest.mark.slow),
-        pytest.param("admittance", Motion.CIRCLE, 0.002, marks=pytest.mark.slow),
+        ("cartesian_impedance", Motion.CIRCLE, 0.006),
+        ("joint_impedance", Motion.CIRCLE, 0.002),
+        ("cartesian_impedance", Motion.SWING, 0.006),
+        ("admittance", Motion.SWING, 0.002),
+        ("admittance", Motion.CIRCLE, 0.002),
     ],
 )
 def test_motions_are_tracked_in_free_space(law: str, motion: int, tolerance: float) -> None:
@@ -129,6 +130,7 @@ def test_pushed_cartesian_impedance_yields_by_force_over_stiffness() -> None:
     np.testing.assert_allclose(run.tip - before, force / run.read("dps.impl.stiffness")[3:], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_pushed_admittance_moves_like_its_mass_damper_and_spring() -> None:
     run = Run(built("admittance"), **SMOOTH)
     run.advance(0.2)  # the first readings of sensors have passed
@@ -148,7 +150,8 @@ def test_pushed_admittance_moves_like_its_mass_damper_and_spring() -> None:
     np.testing.assert_allclose((run.tip - before)[axis], force / K, rtol=2e-3)
 
 
-@pytest.mark.parametrize("law", ["cartesian_impedance", pytest.param("admittance", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["cartesian_impedance", "admittance"])
 def test_force_on_the_wall_is_that_of_two_springs_in_series(law: str) -> None:
     scenario = ManipulatorScenario(law=law, wall=True)
     run = Run(scenario.build(), Motion.PRESS, **SMOOTH)

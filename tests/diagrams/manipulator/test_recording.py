@@ -30,13 +30,8 @@ def hub() -> Iterator[Hub]:
         yield running
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        FIRST_LAW,
-        *(pytest.param(law, marks=[pytest.mark.one_python, pytest.mark.slow]) for law in FURTHER_LAWS),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [FIRST_LAW, *(pytest.param(law, marks=pytest.mark.one_python) for law in FURTHER_LAWS)])
 def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path, law: str) -> None:
     """By the DPS alone, as it was recorded, and in the whole testbed; against a machine with other parameters."""
     scenario = ManipulatorScenario(law=law)

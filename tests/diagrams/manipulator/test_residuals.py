@@ -46,7 +46,7 @@ def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:
     return {mode: ResidualMonitor(loop, mode, worker=False, **options) for mode, loop in loops.items()}
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scenario",
     [

@@ -47,6 +47,7 @@ def test_full_testbed_tends_to_the_momentum_model():
     assert errors[1] / errors[0] == pytest.approx(0.5, abs=0.1)
 
 
+@pytest.mark.slow
 def test_mental_testbed_has_no_forces_and_the_same_addresses():
     scenario = ArmMotionScenario(thinking_time=0.2).mental()
     testbed = scenario.build()

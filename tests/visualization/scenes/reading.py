@@ -13,7 +13,6 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
-from rerun.chunk import McapReader, RrdReader
 
 WORLD = "world"
 
@@ -68,6 +67,8 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
+        from rerun.chunk import McapReader, RrdReader  # They take long to load.
+
         self._times: dict[tuple[str, str], list[int]] = defaultdict(list)
         self.rows: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for chunk in (McapReader if path.suffix == ".mcap" else RrdReader)(path).stream():
