@@ -158,7 +158,13 @@ class BelievedTerrain:
         return np.stack(np.gradient(self.ground.heights, self.ground.cell))
 
     def world_model(
-        self, *, near: Sequence[float], radius: float, heights: Array | None = None, towards: float | None = None
+        self,
+        *,
+        near: Sequence[float],
+        radius: float,
+        heights: Array | None = None,
+        towards: float | None = None,
+        datum: float = 0.0,
     ) -> WorldModel:
         """Return the semantic world model around a place: patches of ground, and rocks that stand on them.
 
@@ -170,13 +176,14 @@ class BelievedTerrain:
             radius: How far it reaches, in m.
             heights: Heights at the vertices, for example a draw; the believed ones by default.
             towards: Azimuth in rad behind which only the next metres are needed; None for all around.
+            datum: The height of the world's origin in m, over which the heights in the world are.
 
         Raises:
             OffTheMapError: The place is beside the map.
         """
         ground = self.ground
         ground.height([near])
-        z = ground.heights if heights is None else heights
+        z = (ground.heights if heights is None else heights) - datum
         vertices = ground.vertices().reshape(*z.shape, 2)
         middles = 0.25 * (vertices[:-1, :-1] + vertices[1:, :-1] + vertices[:-1, 1:] + vertices[1:, 1:])
         offsets = middles - np.asarray(near, dtype=float)

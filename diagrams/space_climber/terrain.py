@@ -34,6 +34,7 @@ sets out from the middle with a heading within 45 deg.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -300,17 +301,24 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
     """
     world, default = plant.world_body(), ProximityProperties()
     vertices, triangles = crater.mesh
-    for k, triangle in enumerate(triangles):
-        top = vertices[triangle]
-        X_WT, shape = prism(top)
-        plant.RegisterCollisionGeometry(world, X_WT, shape, f"ground_{k}", default)
     plant.RegisterVisualGeometry(
         world, RigidTransform(), Mesh(obj_mesh(vertices, triangles, name="terrain"), 1.0), "ground", GREY
     )
-    for k, block in enumerate(crater.blocks):
-        X_WB = RigidTransform(RollPitchYaw(block.rpy), [block.x, block.y, float(crater.height(block.x, block.y))])
-        plant.RegisterCollisionGeometry(world, X_WB, Box(*block.size), f"boulder_{k}", default)
-        plant.RegisterVisualGeometry(world, X_WB, Box(*block.size), f"boulder_{k}", _BOULDER_GREY)
+    for name, shape, X_WS in crater_shapes(crater):
+        plant.RegisterCollisionGeometry(world, X_WS, shape, name, default)
+        if isinstance(shape, Box):
+            plant.RegisterVisualGeometry(world, X_WS, shape, name, _BOULDER_GREY)
+
+
+def crater_shapes(crater: Crater) -> Iterator[tuple[str, Box | Convex, RigidTransform]]:
+    """Yield the shapes that a robot touches, each with its name and its pose in the world: ground, then boulders."""
+    vertices, triangles = crater.mesh
+    for k, triangle in enumerate(triangles):
+        X_WT, prism_shape = prism(vertices[triangle])
+        yield f"ground_{k}", prism_shape, X_WT
+    heights = crater.height([b.x for b in crater.blocks], [b.y for b in crater.blocks]).tolist()
+    for k, (block, z) in enumerate(zip(crater.blocks, heights, strict=True)):
+        yield f"boulder_{k}", Box(*block.size), RigidTransform(RollPitchYaw(block.rpy), [block.x, block.y, z])
 
 
 def prism(top: Array) -> tuple[RigidTransform, Convex]:

@@ -20,9 +20,13 @@ from vtbdrake.common.argument_checks import as_addresses, as_array, as_flag, as_
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.lru import LruDict
 from vtbdrake.compiled.equations import Timing, UnsupportedTestbedError
+from vtbdrake.compiled.plant import TERRAIN
 from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.compiled.walker import InstantOutputs, Walker
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
+from vtbdrake.components.compiled_plant.contact import FixedPiece
+from vtbdrake.components.compiled_plant.ground import Terrain
+from vtbdrake.components.compiled_plant.links import UnsupportedPlantError
 from vtbdrake.drake_workarounds.making import making
 from vtbdrake.state import Variables
 from vtbdrake.testbed.addressed import check_root
@@ -159,6 +163,7 @@ class CompiledRollouts:
         self._last_plan: tuple[list[Instant], Program, Array] | None = None
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
         self._lock = threading.Lock()
+        self._terrain: Terrain | None = None
         self._refuse_initialization()
         program = self.program(self.schedule_at(context.get_time()))
         if compile is None and not program.is_machine_code:
@@ -193,6 +198,41 @@ class CompiledRollouts:
             raise ValueError(f"give what varies as {{address: values, ...}}, not as {values!r}")
         start = self.walker.context if context is None else context
         return self.from_z(self.filled(self.z_of(start), values or {}), start.get_time())
+
+    def terrain(self, pieces: Sequence[FixedPiece]) -> Terrain:
+        """Return another terrain than the one that is compiled in, for `stand_on`; nothing is compiled again.
+
+        Args:
+            pieces: The pieces of the terrain, in place of all fixed pieces that the plant's spheres may touch.
+
+        Raises:
+            ValueError: A piece is impossible.
+            UnsupportedTestbedError: The Diagram has no plant with one ground, see `PointContact.terrain`.
+        """
+        try:
+            terrain: Terrain = self._ground().terrain(pieces)
+        except UnsupportedPlantError as error:
+            raise UnsupportedTestbedError(str(error)) from None
+        return terrain
+
+    def stand_on(self, terrain: Terrain | None) -> None:
+        """Let all rollouts from now on be on another terrain. No rollout may be under way.
+
+        Args:
+            terrain: The terrain; None: the one that is compiled in.
+        """
+        self._ground().constants[TERRAIN] = 0.0 if terrain is None else terrain.number
+        self._terrain = terrain
+
+    def _ground(self) -> Any:
+        """Return the equations of the plant whose ground a terrain replaces."""
+        grounds = [each for each in self.walker.equations.values() if TERRAIN in each.constants]
+        if len(grounds) != 1:
+            raise UnsupportedTestbedError(
+                f"a terrain replaces the ground of one plant, but {len(grounds)} plants of the testbed have more than "
+                "sixteen fixed pieces that each of their spheres may touch"
+            )
+        return grounds[0]
 
     def z_of(self, context: Context) -> Array:
         """Return the vector of state and parameters of a root context, shape (nz,)."""
@@ -245,6 +285,7 @@ class CompiledRollouts:
             t0: The time at the start, in s.
         """
         self.walker.check_fixed(z, self._z0)
+        z = self.walker.with_constants(z)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
         chunks = [slice(k, k + program.most) for k in range(0, len(z), program.most)]

@@ -105,6 +105,10 @@ class At(ABC):
         """Return a parameter that is none of a numeric group; see `Equations.extras`."""
 
     @abstractmethod
+    def constant(self, name: str) -> Expression:
+        """Return a number that is in no context; see `Equations.constants`."""
+
+    @abstractmethod
     def shared(self, name: str, make: Callable[[], Any]) -> Any:
         """Return the result of ``make``, made once for all outputs and the update of this instant.
 
@@ -130,6 +134,8 @@ class Equations(ABC):
         timing: When `update` is made; None: never.
         extras: Variables that lie in no numeric group, such as masses, by the name under which `At.extra` returns them,
             with their sizes; they are among those that vary.
+        constants: Numbers that are in no context, such as the one of a terrain, with their values, by the name under
+            which `At.constant` returns them; a call may replace them.
         draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
         may_be_infinite: Whether its discrete state may be infinite or NaN in a valid rollout.
         doubtful: What is wrong where `doubt` is positive, as a sentence.
@@ -143,6 +149,7 @@ class Equations(ABC):
     endings: tuple[str, ...] = ()
     agreement = 1e-11
     extras: dict[str, int]
+    constants: dict[str, float]
     draws: dict[str, Draw]
 
     def __init__(self, system: System, context: Context, varied: frozenset[str]) -> None:
@@ -158,7 +165,7 @@ class Equations(ABC):
             UnsupportedTestbedError: The system has no equations.
         """
         self.system = system
-        self.extras, self.draws = {}, {}
+        self.extras, self.constants, self.draws = {}, {}, {}
         self.timing = unique_timing(system)
 
     @abstractmethod

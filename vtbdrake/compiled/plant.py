@@ -16,8 +16,8 @@ from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refus
 from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
-from vtbdrake.components.compiled_plant.contact import Contacts, PointContact, contact_pairs
-from vtbdrake.components.compiled_plant.ground import SLOTS
+from vtbdrake.components.compiled_plant.contact import Contacts, FixedPiece, PointContact, contact_pairs
+from vtbdrake.components.compiled_plant.ground import SLOTS, Terrain
 from vtbdrake.components.compiled_plant.sap import Drive, SapSolver, stops
 from vtbdrake.state.multibody import POSE_ENTRIES, bodies, element_address, multibody_variables
 from vtbdrake.state.variables import A, Variable
@@ -29,6 +29,9 @@ _NOT_ACTING = ("geometry_query",)
 _TAKEN = ("actuation", "_desired_state")
 # The names of output ports end so whose values belong to a step.
 _OF_A_STEP = ("reaction_forces", "contact_results", "net_actuation")
+
+TERRAIN = "terrain"
+"""The name of the constant of a plant with ground that tells on which terrain it is, see `PlantEquations.terrain`."""
 
 # The name of the present step, which several outputs share with the update.
 _STEP = "step"
@@ -97,6 +100,7 @@ class PlantEquations(Equations):
         except CompilerError as error:
             raise refusal(system, f"has contact, which is written in C: {error}") from None
         if self._contact.grounds:
+            self.constants[TERRAIN] = 0.0
             self.doubtful += f", or a sphere touches more than {SLOTS} pieces of ground"
         self._drives = _drives(system, context)
         self._solver = self._new_solver()
@@ -120,6 +124,14 @@ class PlantEquations(Equations):
         if pairs:
             self.agreement = _AGREEMENT_OF_ITERATED_PAIRS if self._contact.is_iterated() else _AGREEMENT_IN_CONTACT
         return solver
+
+    def terrain(self, pieces: Sequence[FixedPiece]) -> Terrain:
+        """Return another terrain than the one that is compiled in, see `PointContact.terrain`; `TERRAIN` names it.
+
+        Args:
+            pieces: Its pieces.
+        """
+        return self._contact.terrain(pieces)
 
     def output(self, port: str, at: At) -> Expression:
         x = at.state(0)
@@ -215,7 +227,8 @@ class PlantEquations(Equations):
             overrun = casadi.SX(model.overrun(q, v_next, period))
             return _Step(q, v, vdot, v_next, casadi.SX(3, 0), casadi.SX(0, 1), overrun, None)
         places = [drive.u for drive in self._drives.values()]
-        solution = self._solver.step(q, v, tau, desired=self._desired(at), feed_forward=u[places])
+        terrain = at.constant(TERRAIN) if self.constants else 0.0
+        solution = self._solver.step(q, v, tau, desired=self._desired(at), feed_forward=u[places], terrain=terrain)
         return _Step(q, v, (solution.v_next - v) / period, *solution)
 
     def update(self, at: At) -> dict[int, Expression]:

@@ -49,6 +49,7 @@ from vtbdrake.testbed.dependencies import connections, writer_of
 from vtbdrake.testbed.switch import T_ACT
 
 EXTRA = "extra"
+CONSTANT = "constant"
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Block:
 
     Attributes:
         path: Path of the system.
-        kind: ``discrete`` or ``parameter`` for a group of its context, or ``extra``, see `Equations`.
+        kind: ``discrete`` or ``parameter`` for a group of its context, or ``extra`` or ``constant``, see `Equations`.
         name: Number of the group, or the name.
         entries: Where it lies in z.
     """
@@ -142,9 +143,20 @@ class Walker:
         for block in self.blocks.values():
             if block.kind == EXTRA:
                 z[block.entries] = np.ravel(self.variables[self._address(block)].get(context))
+            elif block.kind == CONSTANT:
+                z[block.entries] = self.equations[block.path].constants[str(block.name)]
             else:
                 leaf_context = self._systems[block.path].GetMyContextFromRoot(context)
                 z[block.entries] = read_group(leaf_context, block.kind, int(block.name))
+        return z
+
+    def with_constants(self, z: Array) -> Array:
+        """Return vectors z, shape (n, size), with the present values of `Equations.constants`."""
+        constants = [block for block in self.blocks.values() if block.kind == CONSTANT]
+        if constants:
+            z = z.copy()
+        for block in constants:
+            z[:, block.entries] = self.equations[block.path].constants[str(block.name)]
         return z
 
     def write(self, z: Array, context: Context) -> None:
@@ -156,7 +168,7 @@ class Walker:
         """
         self._write_extras(z, context)
         for block in self.blocks.values():
-            if block.kind != EXTRA:
+            if block.kind not in (EXTRA, CONSTANT):
                 leaf_context = self._systems[block.path].GetMyMutableContextFromRoot(context)
                 write_group(leaf_context, block.kind, int(block.name), z[block.entries])
 
@@ -568,6 +580,7 @@ class Walker:
                 count = leaf_context.num_numeric_parameter_groups()
                 sizes += [(PARAMETER, i, leaf_context.get_numeric_parameter(i).size()) for i in range(count)]
             sizes += [(EXTRA, name, size) for name, size in equations.extras.items()]
+            sizes += [(CONSTANT, name, 1) for name in equations.constants]
             for kind, name, size in sizes:
                 yield Block(path, kind, name, slice(start, start + size))
                 start += size
@@ -707,6 +720,9 @@ class _Reading(At):
 
     def extra(self, name: str) -> Expression:
         return self._entries(EXTRA, name)
+
+    def constant(self, name: str) -> Expression:
+        return self._entries(CONSTANT, name)
 
     def shared(self, name: str, make: Callable[[], Any]) -> Any:
         shared, key = self._evaluation.shared, (self._path, name)

@@ -16,6 +16,7 @@ import numpy as np
 from vtbdrake.common.lru import LruDict
 from vtbdrake.compiled import CompiledBatch, CompiledRollouts, CompilerError, UnsupportedTestbedError
 from vtbdrake.compiled.tracing import traced
+from vtbdrake.components.compiled_plant.contact import FixedPiece
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.rollout.executor import Executor, Parameters, SerialExecutor, checked_workers
 from vtbdrake.rollout.pruning import Cutoff
@@ -23,7 +24,7 @@ from vtbdrake.rollout.quality import Measure, QualityError, exceeds, read_qualit
 from vtbdrake.rollout.runner import values_key
 from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
 from vtbdrake.rollout.task import HORIZON, TERMINATED, THRESHOLD, RolloutResult, RolloutTask, check_call
-from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Testbeds, split
+from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Testbeds, failed, split
 from vtbdrake.state.variables import A, Variable
 from vtbdrake.testbed import VirtualTestbed
 
@@ -70,6 +71,7 @@ class CompiledExecutor(Executor):
         self._workers = checked_workers(workers)
         self._compile = compile
         self._compiled: LruDict[Hashable, _CompiledTask] = LruDict(max_testbeds)
+        self._pieces: Sequence[FixedPiece] | None = None
         self._lock = threading.Lock()
 
     def run(
@@ -104,10 +106,25 @@ class CompiledExecutor(Executor):
                         left.append(i)
                     else:
                         yield i, result
-                if left:
+                if self._pieces is not None:
+                    yield from ((i, failed(points[i], "what is compiled cannot make this rollout")) for i in left)
+                elif left:
                     begin = None if start is None else [each for i in left if (each := starts[i])]
                     for k, result in self._drake.run(task, [points[i] for i in left], start=begin, cutoff=cutoff):
                         yield left[k], result
+
+    def stand_on(self, pieces: Sequence[FixedPiece] | None) -> None:
+        """Let all rollouts from now on be on another terrain; see `CompiledRollouts.stand_on`.
+
+        One that the compiled testbed cannot make is then a failed one, because Drake's testbed has its own terrain.
+
+        Args:
+            pieces: The pieces of the terrain; None: the testbed's own.
+        """
+        with self._lock:
+            self._pieces = pieces
+            for compiled in self._compiled.values():
+                compiled.stand_on(pieces)
 
     def close(self) -> None:
         self._compiled.clear()
@@ -160,6 +177,8 @@ class CompiledExecutor(Executor):
                 with Interruptible():
                     testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
                     compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
+                    if self._pieces is not None:
+                        compiled.stand_on(self._pieces)
                 self._compiled.add(key, compiled)
         return compiled
 
@@ -267,6 +286,10 @@ class _CompiledTask:
         shortest = min((period for period, _ in self._testbed.event_timings()), default=0.0)
         for t0 in (begin, begin + _BETWEEN * shortest):
             self._rollouts.from_z(self._z0[np.newaxis], t0)
+
+    def stand_on(self, pieces: Sequence[FixedPiece] | None) -> None:
+        """See `CompiledExecutor.stand_on`."""
+        self._rollouts.stand_on(None if pieces is None else self._rollouts.terrain(pieces))
 
     def varies(self, addresses: frozenset[str]) -> bool:
         """Return whether variables can be varied without compiling again."""

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import date
-from functools import cached_property
+from functools import cache, cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -34,16 +34,24 @@ from pydrake.systems.analysis import SimulatorConfig
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.scan import Scan
-from vtbdrake.reasoning import Budget, Decision, Reasoner, SearchConfig
+from vtbdrake.compiled import CompiledRollouts
+from vtbdrake.components.compiled_plant.contact import FixedPiece
+from vtbdrake.components.compiled_plant.ground import Terrain
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake.reasoning import Budget, Reasoner, SearchConfig
+from vtbdrake.rollout import Executor
+from vtbdrake.rollout.compiled_executor import CompiledExecutor
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake_diagrams.space_climber.believed_scenario import BelievedCraterScenario, believed_world
+from vtbdrake_diagrams.space_climber.believed_scenario import BelievedCraterScenario, believed_world, level_world
 from vtbdrake_diagrams.space_climber.believed_terrain import FRICTION, BelievedTerrain, NoReturnError
 from vtbdrake_diagrams.space_climber.crater_scenario import ENDS, PASSED, X_BL, CraterScenario
 from vtbdrake_diagrams.space_climber.ground_map import OffTheMapError
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.route import CLEARANCE, Route, route
+from vtbdrake_diagrams.space_climber.standing_scanner import StandingScanner
 from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, MASS, POSE, WALK, differing
 from vtbdrake_diagrams.space_climber.survey import survey
-from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS
+from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, crater_shapes
 
 ROCK_COVER = 0.03
 """The share of the ground that rocks cover, as at the least rocky landing sites; see `terrain`."""
@@ -54,17 +62,20 @@ FIRST_SEED = 1000
 LEG = 20.0
 """How long the robot walks until it looks again, in s: 3.8 m on level ground."""
 
-LOOKING = 4.2
+LOOKING = 5.0
 """How long it stands and looks, in s: until it stands, and one scan from then on."""
+
+SEGMENT = 5.0
+"""How long the simulated reality goes on in one call, in s."""
 
 TRIED = 28.0
 """Horizon of a rollout in s: longer than a leg, so that it does not end in front of a rock."""
 
-SPREAD = np.radians(40.0)
-"""How far beside the route headings are tried, in rad."""
+WIDEST_TRIED = np.radians(80.0)
+"""How far beside the x axis headings are tried, in rad."""
 
-CANDIDATES = 4
-"""How many headings are tried beside the one along the route."""
+CANDIDATES = 9
+"""How many headings are tried beside the one along the route, 20 deg apart."""
 
 SPEED = 0.19
 """What the robot walks on level ground, in m/s."""
@@ -87,6 +98,7 @@ IMPATIENT = 90.0
 HEADINGS = np.linspace(-LIMIT, LIMIT, 13)
 """Fixed headings in rad, 7.5 deg apart: a crater is passable if one passes; the least steep one is a strategy."""
 
+FIXED_STRATEGIES = ("least slope", "straight")
 LOOKING_STRATEGIES = ("reasoned", "perceived route")
 STRATEGIES = ("reasoned", "surveyed route", "least slope", "straight", "perceived route")
 COMPARED = STRATEGIES[:4]
@@ -139,12 +151,12 @@ class Walk:
     thinking: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class CostToRim:
     """The quality of a rollout, which is to be small: the believed cost to the rim in m, see `route`.
 
     Attributes:
-        route: The route over the believed terrain.
+        route: The route over the terrain as it is believed to be now; each stop has another one.
     """
 
     route: Route
@@ -161,7 +173,13 @@ def true_world(seed: int) -> CraterScenario:
         patience=IMPATIENT,
         scans=True,
         simulator_config=SimulatorConfig(),
-        plant_config=MultibodyPlantConfig(time_step=0.02, contact_model="point", discrete_contact_approximation="sap"),
+        plant_config=MultibodyPlantConfig(
+            time_step=0.02,
+            contact_model="point",
+            discrete_contact_approximation="sap",
+            # What contact switches see is then compiled, too.
+            use_sampled_output_ports=False,
+        ),
     )
 
 
@@ -221,6 +239,113 @@ class Rover:
             self.ended = next((end for end in ENDS if end in message), message)
 
 
+class CompiledRover(Rover):
+    """The same robot in the same world, which is compiled once for all craters; the crater is data.
+
+    It scans when it is asked, as if it had stood still before.
+
+    Args:
+        world: The simulated reality.
+        terrain: Its ground and boulders.
+        scanner: What looks at them.
+        mass: Factor of the torso's mass.
+    """
+
+    def __init__(self, world: CraterScenario, terrain: Terrain, scanner: StandingScanner, *, mass: float) -> None:
+        self.testbed, self._rollouts = compiled_world()
+        self._terrain, self._scanner = terrain, scanner
+        self.context = self.testbed.default_context()
+        pose = np.array(self.testbed.read(self.context, POSE))
+        # As high over the highest place under its feet as in the testbed that was compiled.
+        pose[2] += _lowest_start(world) - _lowest_start(self.testbed.scenario)
+        self.testbed.write(self.context, {WALK: 0.0, MASS: mass * self.testbed.read(self.context, MASS), POSE: pose})
+        self.ended: str = ""
+
+    def scan(self) -> Scan:
+        pose = np.array(self.testbed.read(self.context, POSE))
+        return self._scanner.scan(RigidTransform(RollPitchYaw(pose[3:]), pose[:3]), self.time)
+
+    def advance(self, duration: float, **commands: float) -> None:
+        self.testbed.write(self.context, {f"u.{name}": value for name, value in commands.items()})
+        (z,), (end,), (self.ended,) = self.simulate(self.states([{}]), self.time, duration)
+        self.set_state(z, end)
+
+    def set_state(self, z: Array, time: float) -> None:
+        """Set the state to a vector of state and parameters, and the time (s)."""
+        self._rollouts.walker.write(z, self.context)
+        self.context.SetTime(time)
+
+    def states(self, values: Sequence[Mapping[str, float]]) -> Array:
+        """Return the vectors of state and parameters with values by address, a row for each mapping."""
+        rows = []
+        for each in values:
+            self.testbed.write(self.context, each)
+            rows.append(self._rollouts.z_of(self.context))
+        return np.array(rows)
+
+    def simulate(self, z: Array, begin: float, duration: float) -> tuple[Array, list[float], list[str]]:
+        """Return the states at the end of walks, when they ended (s), and the messages of those that ended early.
+
+        Args:
+            z: The states at the begin, shape (n, nz).
+            begin: The time at the begin in s.
+            duration: How long they go on at most, in s.
+        """
+        self._rollouts.stand_on(self._terrain)
+        z, now, finish = z.copy(), begin, begin + duration
+        under_way, ends, messages = np.arange(len(z)), np.full(len(z), finish), [""] * len(z)
+        while len(under_way) and now < finish - 0.5 * SEGMENT:
+            batch = self._rollouts.from_z(z[under_way], now)
+            z[under_way] = batch.final
+            for row, k in enumerate(under_way.tolist()):
+                if not batch.valid[row]:
+                    messages[k], ends[k] = f"{NOT_COMPILED}: {batch.reasons[row]}", now
+                elif batch.messages[row]:
+                    messages[k] = next(end for end in ENDS if end in batch.messages[row])
+                    ends[k] = now + batch.ends[row]
+            now = self._rollouts.schedule_at(now)[-1].time
+            under_way = np.array([k for k in under_way if not messages[k]], dtype=int)
+        ends[under_way] = now
+        return z, ends.tolist(), messages
+
+
+NOT_COMPILED = "the compiled world does not hold"
+"""A walk that ends so is none: the world has to be simulated in Drake."""
+
+
+@cache
+def compiled_world() -> tuple[VirtualTestbed, CompiledRollouts]:
+    """Return a testbed of the simulated reality, and its compiled rollouts, which stand on any crater."""
+    testbed = replace(true_world(0), scans=False, boulders=False, rock_cover=0.0).build()
+    rollouts = testbed.compiled(horizon=SEGMENT, sample_period=SEGMENT, parameters=[HEADING, WALK, MASS], check=False)
+    return testbed, rollouts
+
+
+def terrain_of(world: CraterScenario) -> Terrain:
+    """Return ground and boulders of a world for `compiled_world`, with its friction of feet and ground."""
+    testbed, rollouts = compiled_world()
+    feet = testbed.scenario.friction
+    ground = combined_friction(world.friction, feet)
+    return rollouts.terrain([FixedPiece(shape, X_WS, ground) for _, shape, X_WS in crater_shapes(world.crater)])
+
+
+def combined_friction(friction: float, feet: float) -> float:
+    """Return the friction b of ground that makes a given one with feet of the friction a: Drake has 2 a b / (a + b)."""
+    return friction * feet / (2.0 * feet - friction)
+
+
+def _lowest_start(world: CraterScenario) -> float:
+    return float(world.crater.mesh_height(Morphology().stance[:, :2]).max())
+
+
+@cache
+def mental_reasoner() -> tuple[Reasoner, CompiledExecutor, CostToRim, BelievedCraterScenario]:
+    """Return the reasoner of all stops, its executor and its quality, whose world and route each stop sets."""
+    scenario = believed_world(true_world(0), level_world(), friction=FRICTION[0] - FRICTION[1])
+    quality, executor = CostToRim(Route((0.0, 0.0), np.zeros((2, 2)))), CompiledExecutor(compile=True, workers=1)
+    return heading_reasoner(scenario, quality, executor=executor), executor, quality, scenario
+
+
 @dataclass
 class Explorer:
     """The robot's head: what it believes, and how it decides at a stop.
@@ -271,28 +396,45 @@ class Explorer:
         """Return for the headings that were tried by how much they lower the cost to the rim, in m: at worst."""
         rover.testbed.write(rover.context, {HEADING: ahead, WALK: 1.0})
         start = way.cost_at(rover.place)
-        reasoners = [self._reasoner(way, ahead, rover.place, draw) for draw in range(self.draws + 1)]
-        first = [each.decide(rover.testbed, rover.context, budget=Budget(rollouts=1)) for each in reasoners]
-        along = _gains(first, ahead, start)
+        along = self._gains(rover, way, ahead, Budget(rollouts=1))
         # As far as the route goes down on the level, over the horizon and without a rock.
         end = way.path(rover.place, length=SPEED * TRIED)[-1]
         if min(along.values(), default=-np.inf) >= ENOUGH * (start - way.cost_at(end)):
             return along
-        return _gains([each.decide(rover.testbed, rover.context) for each in reasoners], ahead, start)
+        return self._gains(rover, way, ahead, None)
 
-    def _reasoner(self, way: Route, ahead: float, place: Array, draw: int) -> Reasoner:
-        heights = self.terrain.ground.draw(np.random.default_rng(draw)) if draw else None
-        return heading_reasoner(
-            self.mental(place, towards=ahead, heights=heights), CostToRim(way), about=ahead, spread=SPREAD
-        )
+    def _gains(self, rover: Rover, way: Route, ahead: float, budget: Budget | None) -> dict[float, float]:
+        """Return for each heading (rad) the least gain in the believed world and in draws of it, in m.
 
-    def mental(
-        self, place: ArrayLike, *, towards: float | None = None, heights: Array | None = None
-    ) -> BelievedCraterScenario:
-        """Return the mental world around a place: what the robot believes, as a scenario to simulate."""
+        A failed rollout is a loss of all.
+        """
+        reasoner, executor, quality, scenario = mental_reasoner()
+        quality.route, start = way, way.cost_at(rover.place)
+        gains: dict[float, float] = {}
+        for number in range(self.draws + 1):
+            heights = self.terrain.ground.draw(np.random.default_rng(number)) if number else None
+            executor.stand_on(scenario.pieces(self._world(rover.place, heights=heights)))
+            for candidate in reasoner.decide(rover.testbed, rover.context, budget=budget).candidates:
+                heading = float(candidate.values.get(HEADING, ahead))
+                value = start - candidate.quality if np.isfinite(candidate.quality) else -start
+                gains[heading] = min(gains.get(heading, np.inf), value)
+        return gains
+
+    def _world(self, place: ArrayLike, *, heights: Array | None = None) -> WorldModel:
+        """Return ground and rocks around a place, over the believed ground at this place."""
         near = np.asarray(place, dtype=float).tolist()
-        world = self.terrain.world_model(near=near, radius=RADIUS, towards=towards, heights=heights)
-        return believed_world(self.scenario, world, friction=FRICTION[0] - FRICTION[1])
+        datum = float(self.terrain.ground.height([near], heights)[0])
+        # Headings are tried to either side of the x axis.
+        return self.terrain.world_model(near=near, radius=RADIUS, towards=0.0, heights=heights, datum=datum)
+
+    def mental(self, place: ArrayLike, *, heights: Array | None = None) -> BelievedCraterScenario:
+        """Return the mental world around a place as a scenario to simulate: what the robot believes.
+
+        Args:
+            place: The place (x, y) in m, whose believed height is 0 in that world.
+            heights: Heights at the vertices of the map, for example a draw; the believed ones by default.
+        """
+        return replace(mental_reasoner()[3], world=self._world(place, heights=heights))
 
     def felt(self, path: Sequence[Array], stepped: float) -> None:
         """Take what the robot felt on its way: how far it came by how far it stepped."""
@@ -302,37 +444,24 @@ class Explorer:
 
 
 def heading_reasoner(
-    scenario: BelievedCraterScenario, quality: Callable[[Array], float], *, about: float, spread: float
+    scenario: BelievedCraterScenario, quality: Callable[[Array], float], *, executor: str | Executor = "serial"
 ) -> Reasoner:
-    """Return the reasoner of one stop, which decides the next heading.
+    """Return the reasoner that decides the next heading.
 
     Args:
         scenario: The mental world.
         quality: What the pose at the end of a rollout costs, in m.
-        about: The middle of the headings, in rad.
-        spread: How far they reach to either side, in rad.
+        executor: Where the rollouts run.
     """
-    lower, upper = np.clip([about - spread, about + spread], -np.pi, np.pi)
     return Reasoner(
         scenario=scenario,
-        decision=[vtb.Parameter(HEADING, lower, upper)],
+        decision=[vtb.Parameter(HEADING, -WIDEST_TRIED, WIDEST_TRIED)],
         quality=vtb.Quality(quality, of=POSE, reading="end", minimize=True),
         budget=Budget(rollouts=CANDIDATES + 1),
         horizon=TRIED,
         sample_period=4.0,
-        search=SearchConfig(method="grid", options={"points": CANDIDATES}, executor="serial"),
+        search=SearchConfig(method="grid", options={"points": CANDIDATES}, executor=executor),
     )
-
-
-def _gains(decisions: Sequence[Decision], ahead: float, start: float) -> dict[float, float]:
-    """Return for each heading (rad) the least gain over several decisions, in m; of a failed rollout, a loss of all."""
-    gains: dict[float, float] = {}
-    for decision in decisions:
-        for candidate in decision.candidates:
-            heading = float(candidate.values.get(HEADING, ahead))
-            value = start - candidate.quality if np.isfinite(candidate.quality) else -start
-            gains[heading] = min(gains.get(heading, np.inf), value)
-    return gains
 
 
 class Site:
@@ -344,19 +473,29 @@ class Site:
         terrain: What is known before the robot looks.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, *, in_drake: bool = False) -> None:
+        """Survey a crater.
+
+        Args:
+            seed: The crater's seed.
+            in_drake: Whether Drake simulates the world, its scanner included, instead of `compiled_world`.
+        """
         self.seed: int = seed
+        self._in_drake = in_drake
         self.world: CraterScenario = true_world(seed)
         prior = survey(self.world.crater, seed=0)
         self.terrain: BelievedTerrain = BelievedTerrain(prior.ground, prior.rocks)
 
     @cached_property
-    def _testbed(self) -> VirtualTestbed:
-        return self.world.build()
+    def _compiled_parts(self) -> tuple[Terrain, StandingScanner]:
+        return terrain_of(self.world), StandingScanner(self.world.crater)
 
     def rover(self) -> Rover:
         """Return a robot that stands at the bottom."""
-        return Rover(self._testbed, mass=differing(self.seed, self.seed).mass)
+        mass = differing(self.seed, self.seed).mass
+        if self._in_drake:
+            return Rover(self.world.build(), mass=mass)
+        return CompiledRover(self.world, *self._compiled_parts, mass=mass)
 
     def run(self, strategy: str) -> Walk:
         """Let a strategy of `STRATEGIES` find its way out.
@@ -364,13 +503,15 @@ class Site:
         Raises:
             ValueError: There is no such strategy.
         """
-        if strategy == "straight":
-            return self.fixed(0.0, strategy)
-        if strategy == "least slope":
-            return self.fixed(least_slope(self.terrain), strategy)
+        if strategy in FIXED_STRATEGIES:
+            return self.fixed(self.heading_of(strategy), strategy)
         if strategy not in STRATEGIES:
             raise ValueError(f"a strategy is one of {', '.join(STRATEGIES)}, not {strategy!r}")
         return self.explore(strategy)
+
+    def heading_of(self, strategy: str) -> float:
+        """Return the heading (rad) of one of `FIXED_STRATEGIES`."""
+        return least_slope(self.terrain) if strategy == "least slope" else 0.0
 
     def explore(self, strategy: str = "reasoned", *, draws: int = 0) -> Walk:
         """Let the robot find its way out with looking, or along the route over the survey.
@@ -403,6 +544,21 @@ class Site:
             rover.advance(0.25 * LEG, heading=heading, walk=1.0)
             path.append(rover.place)
         explorer.felt(path, float(np.linalg.norm(rover.stepped - begun)))
+
+    def all_fixed(self, headings: Sequence[float]) -> list[Walk]:
+        """Walk in each of the headings (rad) until the end, side by side in the compiled world."""
+        if not headings:
+            return []
+        rover = self.rover()
+        assert isinstance(rover, CompiledRover)
+        rover.advance(LOOKING, walk=0.0)
+        begin = rover.states([{HEADING: heading, WALK: 1.0} for heading in headings])
+        z, ends, messages = rover.simulate(begin, rover.time, LONGEST - LOOKING)
+        walks = []
+        for heading, state, rover.ended, end in zip(headings, z, messages, ends, strict=True):
+            rover.set_state(state, end)
+            walks.append(_walk(self.seed, heading_name(heading), rover))
+        return walks
 
     def fixed(self, heading: float, strategy: str = "") -> Walk:
         """Walk in one heading (rad) until the end."""
@@ -550,6 +706,27 @@ def draw(walk: Walk) -> Figure:
     return figure
 
 
+def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = STRATEGIES) -> Iterator[Walk]:
+    """Yield the walks in a crater that are not among others: of strategies, and fixed ones until one passes.
+
+    Args:
+        seed: The crater's seed.
+        walks: Walks that are there, in this and other craters.
+        strategies: The strategies.
+    """
+    site, there = Site(seed), {walk.strategy: walk for walk in walks if walk.seed == seed}
+    fixed = {name: site.heading_of(name) for name in strategies if name in FIXED_STRATEGIES and name not in there}
+    for name, walk in zip(fixed, site.all_fixed(list(fixed.values())), strict=True):
+        there[name] = replace(walk, strategy=name)
+        yield there[name]
+    for name in [name for name in strategies if name not in there]:
+        there[name] = site.run(name)
+        yield there[name]
+    if Crossing(seed, there).passable is None:
+        # Straight on is one of them.
+        yield from site.all_fixed([each for each in HEADINGS if each and heading_name(each) not in there])
+
+
 @click.command()
 @click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first crater.")
 @click.option("--count", default=1, show_default=True, help="Number of craters.")
@@ -560,14 +737,8 @@ def main(first: int, count: int, file: str, figure: str, strategies: tuple[str, 
     """Let the robot find its way out of craters, and compare strategies; walks of the file are not repeated."""
     path = Path(file)
     for seed in range(first, first + count):
-        site = Site(seed)
-        for strategy in strategies:
-            if not any(walk.seed == seed and walk.strategy == strategy for walk in load(path)):
-                save(site.run(strategy), path)
-        for heading in sorted(HEADINGS, key=abs):
-            crossing = next(each for each in crossings(load(path)) if each.seed == seed)
-            if crossing.passable is None and heading and heading_name(heading) not in crossing.walks:
-                save(site.fixed(heading), path)
+        for walk in missing_walks(seed, load(path), strategies):
+            save(walk, path)
         crossing = next(each for each in crossings(load(path)) if each.seed == seed)
         for name, walk in crossing.walks.items():
             click.echo(f"crater {seed}, {name}: {_summary(walk)}")

@@ -77,6 +77,11 @@ def compiled_kernel(name: str, source: str) -> casadi.Function:
     return function
 
 
+def kernel_library(name: str) -> Path:
+    """Return the file of the library of a kernel (see `compiled_kernel`) of this process."""
+    return _KERNELS[name][0]
+
+
 def kernel_signature(name: str, shapes_in: Sequence[tuple[int, int]], shapes_out: Sequence[tuple[int, int]]) -> str:
     """Return the C functions that describe a kernel of dense matrices to CasADi.
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, Convex, GeometryId, Mesh, SceneGraphInspector, Shape, Sphere
+from pydrake.geometry import Box, Convex, GeometryId, Mesh, PolygonSurfaceMesh, SceneGraphInspector, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
-from vtbdrake.components.compiled_plant.ground import SLOTS, Piece, ground_contact
+from vtbdrake.components.compiled_plant.ground import SLOTS, GroundContact, Piece, Terrain
 from vtbdrake.components.compiled_plant.links import (
     UnsupportedPlantError,
     colliding,
@@ -111,6 +111,20 @@ class Contacts(NamedTuple):
     doubt: Expression
 
 
+class FixedPiece(NamedTuple):
+    """A piece of a terrain, at its place in the world.
+
+    Attributes:
+        shape: A Box or a Convex.
+        X_WP: Its pose in the world.
+        friction: Its coefficient of friction, which Drake combines with the other body's.
+    """
+
+    shape: Shape
+    X_WP: RigidTransform
+    friction: float
+
+
 class Ground(NamedTuple):
     """Spheres, and many fixed pieces that each of them may touch.
 
@@ -182,10 +196,14 @@ class _SurfaceReader:
         shape, X_BG = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
         vertices = np.zeros((0, 3))
         if isinstance(shape, Convex | Mesh):
-            hull = inspector.GetConvexHull(geometry)
-            vertices = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
+            vertices = _hull(inspector.GetConvexHull(geometry))
         number = geometry.get_value()
         return Surface(number, name, int(body.index()), shape, X_BG, stiffness, dissipation, friction, vertices)
+
+
+def _hull(hull: PolygonSurfaceMesh) -> NDArray[np.float64]:
+    """Return the vertices of a convex hull, shape (n, 3), in m."""
+    return np.array([hull.vertex(k) for k in range(hull.num_vertices())])
 
 
 def _pair(first: Surface, second: Surface) -> Pair:
@@ -260,15 +278,20 @@ class PointContact:
                 for at in range(len(self.pairs) + i * SLOTS, len(self.pairs) + (i + 1) * SLOTS):
                     yield contacts.points[:, at], forces[:, at]
 
-    def contacts(self, q: Expression) -> Contacts:
-        """Return all contacts that there may be at positions q, shape (nq, 1)."""
+    def contacts(self, q: Expression, terrain: Expression = 0.0) -> Contacts:
+        """Return all contacts that there may be at positions q, shape (nq, 1).
+
+        Args:
+            q: The positions.
+            terrain: The number of the terrain under the spheres on ground, see `terrain`; 0: the plant's own.
+        """
         touching = [self.touch(pair, q) for pair in self.pairs]
         points = [self._meet(pair, q)[0] for pair in self.pairs]
         poses = [self._pose(sphere, q) for sphere in self._spheres()]
         results, start = [], 0
         for ground, kernel in zip(self.grounds, self._kernels, strict=True):
             R, p = zip(*poses[start : start + len(ground.spheres)], strict=True)
-            results.append(kernel(casadi.densify(casadi.horzcat(*R)), casadi.densify(casadi.horzcat(*p))))
+            results.append(kernel.function(*(casadi.densify(casadi.horzcat(*each)) for each in (R, p)), terrain))
             start += len(ground.spheres)
         on_ground = [[result[k] for result in results] for k in range(7)]
         offsets = casadi.horzcat(casadi.SX(3, 0), *on_ground[2])
@@ -316,27 +339,73 @@ class PointContact:
             grounds[key] = Ground((*spheres, each[0][0]), pieces)
         return tuple(pair for pair in pairs if id(pair) not in on_ground), tuple(grounds.values())
 
-    def _ground_kernel(self, ground: Ground) -> casadi.Function:
-        """Return the function of where spheres touch ground."""
+    def terrain(self, pieces: Sequence[FixedPiece]) -> Terrain:
+        """Return a terrain of other pieces, on which the spheres may stand instead of the plant's own.
+
+        A piece has the stiffness and the dissipation of the plant's first one.
+
+        Args:
+            pieces: The pieces.
+
+        Raises:
+            ValueError: There are no pieces, or a shape cannot be a piece.
+            UnsupportedPlantError: The plant has no ground to replace, or several.
+        """
+        if len(self.grounds) != 1:
+            raise UnsupportedPlantError(
+                f"a terrain replaces the only ground of a plant, and this one has {len(self.grounds)}: fixed pieces, "
+                f"of which each sphere may touch more than {_MANY_PIECES}"
+            )
+        if not pieces:
+            raise ValueError("a terrain has at least one piece, but there are none")
+        (ground,), (kernel,) = self.grounds, self._kernels
+        sample = ground.pieces[0]
+        others = []
+        for k, piece in enumerate(pieces):
+            if not isinstance(piece.shape, Box | Convex):
+                raise ValueError(f"a piece of terrain is a Box or a Convex, not a {type(piece.shape).__name__}")
+            vertices = np.zeros((0, 3)) if isinstance(piece.shape, Box) else _hull(piece.shape.GetConvexHull())
+            others.append(
+                replace(
+                    sample,
+                    geometry=sample.geometry + k,
+                    shape=piece.shape,
+                    X_BG=piece.X_WP,
+                    friction=piece.friction,
+                    vertices=vertices,
+                )
+            )
+        return kernel.terrain(*self._pieces_with_materials(ground.spheres, others, [each.X_BG for each in others]))
+
+    def _ground_kernel(self, ground: Ground) -> GroundContact:
+        """Return the contact of the spheres on a ground."""
         nowhere = casadi.SX.sym("q", self._model.nq)
-        poses = [[casadi.evalf(each).full() for each in self._pose(piece, nowhere)] for piece in ground.pieces]
-        pieces = [
-            Piece(piece.geometry, piece.shape, R, p.ravel(), piece.vertices)
-            for piece, (R, p) in zip(ground.pieces, poses, strict=True)
-        ]
+        poses = []
+        for piece in ground.pieces:
+            R, p = (casadi.evalf(each).full() for each in self._pose(piece, nowhere))
+            poses.append(RigidTransform(np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]])))
+        spheres = [(sphere.geometry, sphere.shape) for sphere in ground.spheres]
+        return GroundContact(spheres, *self._pieces_with_materials(ground.spheres, ground.pieces, poses))
+
+    def _pieces_with_materials(
+        self, spheres: Sequence[Surface], pieces: Sequence[Surface], poses: Sequence[RigidTransform]
+    ) -> tuple[list[Piece], NDArray[np.float64]]:
+        """Return pieces at their poses in the world, and their materials with the spheres, see `GroundContact`."""
         materials = [
             [
                 (
                     *Pair(sphere, piece).material(is_lagged=self._is_lagged),
                     sphere.stiffness / (sphere.stiffness + piece.stiffness),
                 )
-                for piece in ground.pieces
+                for piece in pieces
             ]
-            for sphere in ground.spheres
+            for sphere in spheres
         ]
-        return ground_contact(
-            [(sphere.geometry, sphere.shape) for sphere in ground.spheres], pieces, np.array(materials)
-        )
+        placed = [
+            Piece(piece.geometry, piece.shape, X_WP.rotation().matrix(), X_WP.translation(), piece.vertices)
+            for piece, X_WP in zip(pieces, poses, strict=True)
+        ]
+        return placed, np.array(materials)
 
     # -- where it touches
 

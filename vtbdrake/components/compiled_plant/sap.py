@@ -138,6 +138,7 @@ class SapSolver:
         *,
         desired: Expression = None,
         feed_forward: Expression | None = None,
+        terrain: Expression = 0.0,
     ) -> Solution:
         """Return the velocities after one step, with the forces of contact and actuators.
 
@@ -147,8 +148,9 @@ class SapSolver:
             tau: Generalized forces, without contact, stops and drives, shape (nv, 1).
             desired: Desired positions and velocities of the drives, shape (m, 2); needed if there are some.
             feed_forward: Actuation that is added to the drives' controllers, shape (m, 1); by default none.
+            terrain: The number of the terrain, see `PointContact.contacts`.
         """
-        drives, contacts = self._drives, self._contact.contacts(q)
+        drives, contacts = self._drives, self._contact.contacts(q, terrain)
         A, p_star = self._model.momentum_balance(q, v, tau, self._plant.time_step())
         pulls = [d.p * (desired[k, 0] - q[d.q]) + d.d * desired[k, 1] for k, d in enumerate(drives)]
         arguments = (

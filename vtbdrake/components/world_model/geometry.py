@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -111,7 +111,29 @@ def add_to_plant(plant: MultibodyPlant, model: WorldModel, *, parts: Mapping[str
     """
     from pydrake.geometry import ProximityProperties
 
-    placed: list[tuple[WorldObject, Part]] = []
+    placed = list(placed_parts(model, parts=parts))
+    # Drake's defaults of friction: no variables of its own for each of thousands of geometries.
+    world, default = plant.world_body(), ProximityProperties()
+    for standing, part, X_WS in placed:
+        name = f"{standing.identity}/{part.name}"
+        plant.RegisterVisualGeometry(world, X_WS, part.shape, name, part.color)
+        if part.solid:
+            plant.RegisterCollisionGeometry(world, X_WS, part.shape, name, _material(part) or default)
+    return len(placed)
+
+
+def placed_parts(
+    model: WorldModel, *, parts: Mapping[str, PartsOf] = PARTS
+) -> Iterator[tuple[WorldObject, Part, RigidTransform]]:
+    """Yield the parts of all objects that are believed to be there, with their poses in the world.
+
+    Args:
+        model: The objects; tentative and retired ones are left out.
+        parts: The function that returns the parts of an object, by the object's class.
+
+    Raises:
+        ValueError: There is no function for a class, or an object lacks an attribute that its function needs.
+    """
     for standing in model:
         if standing.is_known:
             if standing.kind not in parts:
@@ -119,15 +141,8 @@ def add_to_plant(plant: MultibodyPlant, model: WorldModel, *, parts: Mapping[str
                 raise ValueError(
                     f"no parts are known of the class {standing.kind} of {standing.identity} (known: {has}): add it"
                 )
-            placed += [(standing, part) for part in parts[standing.kind](standing)]
-    # Drake's defaults of friction: no variables of its own for each of thousands of geometries.
-    world, default = plant.world_body(), ProximityProperties()
-    for standing, part in placed:
-        X_WS, name = standing.X_WO @ part.X_OS, f"{standing.identity}/{part.name}"
-        plant.RegisterVisualGeometry(world, X_WS, part.shape, name, part.color)
-        if part.solid:
-            plant.RegisterCollisionGeometry(world, X_WS, part.shape, name, _material(part) or default)
-    return len(placed)
+            for part in parts[standing.kind](standing):
+                yield standing, part, standing.X_WO @ part.X_OS
 
 
 def _material(part: Part) -> ProximityProperties | None:
