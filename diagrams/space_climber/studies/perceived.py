@@ -53,6 +53,9 @@ from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, MASS,
 from vtbdrake_diagrams.space_climber.survey import survey
 from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, crater_shapes
 
+PLACE = ("sim.sys.climber.base.x", "sim.sys.climber.base.y")
+"""Where the robot is, in m."""
+
 ROCK_COVER = 0.03
 """The share of the ground that rocks cover, as at the least rocky landing sites; see `terrain`."""
 
@@ -97,6 +100,9 @@ IMPATIENT = 90.0
 
 HEADINGS = np.linspace(-LIMIT, LIMIT, 13)
 """Fixed headings in rad, 7.5 deg apart: a crater is passable if one passes; the least steep one is a strategy."""
+
+SIDE_BY_SIDE = 3
+"""How many fixed headings walk in one call, until one passes."""
 
 FIXED_STRATEGIES = ("least slope", "straight")
 LOOKING_STRATEGIES = ("reasoned", "perceived route")
@@ -161,8 +167,8 @@ class CostToRim:
 
     route: Route
 
-    def __call__(self, pose: Array) -> float:
-        return self.route.cost_at(pose[:2])
+    def __call__(self, x: float, y: float) -> float:
+        return self.route.cost_at([float(x), float(y)])
 
 
 def true_world(seed: int) -> CraterScenario:
@@ -444,19 +450,19 @@ class Explorer:
 
 
 def heading_reasoner(
-    scenario: BelievedCraterScenario, quality: Callable[[Array], float], *, executor: str | Executor = "serial"
+    scenario: BelievedCraterScenario, quality: Callable[[float, float], float], *, executor: str | Executor = "serial"
 ) -> Reasoner:
     """Return the reasoner that decides the next heading.
 
     Args:
         scenario: The mental world.
-        quality: What the pose at the end of a rollout costs, in m.
+        quality: What the place (x, y) at the end of a rollout costs, in m.
         executor: Where the rollouts run.
     """
     return Reasoner(
         scenario=scenario,
         decision=[vtb.Parameter(HEADING, -WIDEST_TRIED, WIDEST_TRIED)],
-        quality=vtb.Quality(quality, of=POSE, reading="end", minimize=True),
+        quality=vtb.Quality(quality, of=PLACE, reading="end", minimize=True),
         budget=Budget(rollouts=CANDIDATES + 1),
         horizon=TRIED,
         sample_period=4.0,
@@ -582,6 +588,11 @@ def _walk(seed: int, strategy: str, rover: Rover, stops: Sequence[Stop] = (), th
 
 def least_slope(terrain: BelievedTerrain) -> float:
     """Return the heading in rad, of those at most 45 deg aside, along which the steepest place is the least steep."""
+    return by_slope(terrain)[0]
+
+
+def by_slope(terrain: BelievedTerrain) -> list[float]:
+    """Return `HEADINGS`, sorted by how steep the steepest place along them is."""
     gradients, ground = terrain.slopes(), terrain.ground
     along = np.arange(1.0, RIM_RADIUS + 1.0)
 
@@ -589,7 +600,7 @@ def least_slope(terrain: BelievedTerrain) -> float:
         ways = along[:, None] * [np.cos(heading), np.sin(heading)]
         return float(np.hypot(*(ground.height(ways, gradient) for gradient in gradients)).max())
 
-    return float(min(HEADINGS, key=steepest))
+    return sorted(HEADINGS.tolist(), key=steepest)
 
 
 @dataclass(frozen=True)
@@ -722,9 +733,13 @@ def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = 
     for name in [name for name in strategies if name not in there]:
         there[name] = site.run(name)
         yield there[name]
-    if Crossing(seed, there).passable is None:
-        # Straight on is one of them.
-        yield from site.all_fixed([each for each in HEADINGS if each and heading_name(each) not in there])
+    # Straight on is one of the fixed headings. Some walk side by side, the most promising ones first.
+    open_ = [each for each in by_slope(site.terrain) if each and heading_name(each) not in there]
+    while open_ and Crossing(seed, there).passable is None:
+        for walk in site.all_fixed(open_[:SIDE_BY_SIDE]):
+            there[walk.strategy] = walk
+            yield walk
+        open_ = open_[SIDE_BY_SIDE:]
 
 
 @click.command()

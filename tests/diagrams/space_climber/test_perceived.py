@@ -7,14 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydrake.geometry import Role
 from pydrake.math import RigidTransform
 
 from vtbdrake.common.scan import Scan
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake_diagrams.space_climber import CraterScenario
+from vtbdrake_diagrams.space_climber.believed_scenario import believed_world, level_world
 from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
+from vtbdrake_diagrams.space_climber.crater_scenario import X_BL
 from vtbdrake_diagrams.space_climber.ground_map import GroundMap
-from vtbdrake_diagrams.space_climber.studies import perceived
+from vtbdrake_diagrams.space_climber.standing_scanner import StandingScanner
 from vtbdrake_diagrams.space_climber.studies.perceived import (
     HEADINGS,
     LEAST_GAIN,
@@ -22,10 +25,12 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     Explorer,
     Rover,
     Site,
+    combined_friction,
     least_slope,
     true_world,
 )
 from vtbdrake_diagrams.space_climber.survey import survey
+from vtbdrake_diagrams.space_climber.terrain import Crater
 
 
 def terrain(heights: np.ndarray) -> BelievedTerrain:
@@ -87,10 +92,52 @@ def test_worlds_differ_from_what_the_robot_uses() -> None:
     assert mental.friction == pytest.approx(0.54)
 
 
+def test_pieces_of_a_believed_world_are_its_geometry_in_drake() -> None:
+    """A robot that stands still in both, on a slope, is at the same place after 0.4 s."""
+    heights = FLAT + 0.1 * np.arange(55.0)[:, None]
+    world = terrain(heights).world_model(near=[3.3, 0.4], radius=3.0, datum=0.93)
+    level = believed_world(CraterScenario(), level_world(), friction=0.5)
+    pieces = {
+        (round(float(p.X_WP.translation()[0]), 6), round(float(p.X_WP.translation()[1]), 6)): p
+        for p in level.pieces(world)
+    }
+    testbed = replace(level, world=world).build()
+    inspector = testbed.diagram.GetSubsystemByName("scene_graph").model_inspector()
+    ids = inspector.GetGeometries(inspector.world_frame_id(), Role.kProximity)
+    assert len(ids) == len(pieces) == 2 * len(world.find("ground"))
+    for geometry in ids:
+        X_WG = inspector.GetPoseInFrame(geometry)
+        piece = pieces[round(float(X_WG.translation()[0]), 6), round(float(X_WG.translation()[1]), 6)]
+        np.testing.assert_array_equal(piece.X_WP.GetAsMatrix34(), X_WG.GetAsMatrix34())
+        np.testing.assert_array_equal(
+            piece.shape.GetConvexHull().CalcBoundingBox()[1], inspector.GetConvexHull(geometry).CalcBoundingBox()[1]
+        )
+    assert replace(level, world=world).ground_height(3.3, 0.4) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_ground_for_other_feet_has_the_friction_that_is_asked_for() -> None:
+    """Drake combines a and b to 2 a b / (a + b)."""
+    feet, wanted = 0.62, 0.55
+    ground = combined_friction(wanted, feet)
+    assert 2.0 * feet * ground / (feet + ground) == pytest.approx(wanted)
+
+
+def test_a_standing_scanner_sees_what_the_testbeds_scanner_sees() -> None:
+    """On the level floor, without rocks near, ranges follow from the height and the elevation of each ray."""
+    scan = StandingScanner(Crater(1, boulders=False)).scan(RigidTransform([0.0, 0.0, 0.2]), 5.0)
+    X_WL = RigidTransform([0.0, 0.0, 0.2]) @ X_BL
+    points = (X_WL @ scan.points().T).T
+    near = np.hypot(*points[:, :2].T) < 6.0
+    assert near.sum() > 1000
+    # The noise of a range is 12 mm, and less in height at grazing rays.
+    assert np.abs(points[near, 2]).max() < 5.0 * 0.012
+    assert scan.stamp == pytest.approx(5.0, abs=0.21)
+
+
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_a_robot_looks_tries_and_decides(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceived, "TRIED", 8.0)
+def test_a_robot_looks_tries_and_decides() -> None:
+    """The mental world is compiled, which takes a minute of the C compiler once."""
     world = replace(true_world(1), boulders=False)
     rover = Rover(world.build(), mass=1.0)
     prior = survey(world.crater, seed=0)
