@@ -12,7 +12,7 @@ from pydrake.geometry import Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from vtbdrake.components.compiled_plant.contact import FixedPiece
+from vtbdrake.compiled import FixedPiece
 from vtbdrake.components.world_model import (
     AttributeValue,
     Part,

@@ -14,8 +14,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from tests.compiled.quadruped import surface
-from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
-from vtbdrake.components.compiled_plant.contact import FixedPiece
+from vtbdrake.compiled import CompiledRollouts, FixedPiece, UnsupportedTestbedError
 from vtbdrake.state.systems import collect
 
 RADIUS = 0.1

@@ -6,6 +6,8 @@ from vtbdrake.compiled.components import SensorEquations
 from vtbdrake.compiled.equations import At, Draw, Equations, Fixed, Timing, UnsupportedTestbedError
 from vtbdrake.compiled.registry import EQUATIONS
 from vtbdrake.components.casadi_system.compiler import CompilerError
+from vtbdrake.components.compiled_plant.contact import FixedPiece
+from vtbdrake.components.compiled_plant.ground import Terrain
 
 __all__ = [
     "EQUATIONS",
@@ -17,7 +19,9 @@ __all__ = [
     "Draw",
     "Equations",
     "Fixed",
+    "FixedPiece",
     "SensorEquations",
+    "Terrain",
     "Timing",
     "UnsupportedTestbedError",
 ]

@@ -14,9 +14,8 @@ import casadi
 import numpy as np
 
 from vtbdrake.common.lru import LruDict
-from vtbdrake.compiled import CompiledBatch, CompiledRollouts, CompilerError, UnsupportedTestbedError
+from vtbdrake.compiled import CompiledBatch, CompiledRollouts, CompilerError, FixedPiece, UnsupportedTestbedError
 from vtbdrake.compiled.tracing import traced
-from vtbdrake.components.compiled_plant.contact import FixedPiece
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.rollout.executor import Executor, Parameters, SerialExecutor, checked_workers
 from vtbdrake.rollout.pruning import Cutoff

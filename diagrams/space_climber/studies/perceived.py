@@ -34,9 +34,7 @@ from pydrake.systems.analysis import SimulatorConfig
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.scan import Scan
-from vtbdrake.compiled import CompiledRollouts
-from vtbdrake.components.compiled_plant.contact import FixedPiece
-from vtbdrake.components.compiled_plant.ground import Terrain
+from vtbdrake.compiled import CompiledRollouts, FixedPiece, Terrain
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Executor
@@ -286,7 +284,7 @@ class CompiledRover(Rover):
         rows = []
         for each in values:
             self.testbed.write(self.context, each)
-            rows.append(self._rollouts.z_of(self.context))
+            rows.append(self._rollouts.walker.read(self.context))
         return np.array(rows)
 
     def simulate(self, z: Array, begin: float, duration: float) -> tuple[Array, list[float], list[str]]:
@@ -717,7 +715,7 @@ def draw(walk: Walk) -> Figure:
     return figure
 
 
-def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = STRATEGIES) -> Iterator[Walk]:
+def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = COMPARED) -> Iterator[Walk]:
     """Yield the walks in a crater that are not among others: of strategies, and fixed ones until one passes.
 
     Args:
@@ -747,7 +745,7 @@ def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = 
 @click.option("--count", default=1, show_default=True, help="Number of craters.")
 @click.option("--file", default=str(RESULTS), show_default=True, help="File of results, to which walks are added.")
 @click.option("--figure", default="", help="File of a picture of the first crater's reasoned walk, if there is one.")
-@click.option("--strategy", "strategies", multiple=True, default=STRATEGIES, show_default=True, help="What to compare.")
+@click.option("--strategy", "strategies", multiple=True, default=COMPARED, show_default=True, help="What to compare.")
 def main(first: int, count: int, file: str, figure: str, strategies: tuple[str, ...]) -> None:
     """Let the robot find its way out of craters, and compare strategies; walks of the file are not repeated."""
     path = Path(file)

@@ -353,8 +353,8 @@ class PointContact:
         """
         if len(self.grounds) != 1:
             raise UnsupportedPlantError(
-                f"a terrain replaces the only ground of a plant, and this one has {len(self.grounds)}: fixed pieces, "
-                f"of which each sphere may touch more than {_MANY_PIECES}"
+                f"a terrain replaces the only ground of a plant, and this one has {len(self.grounds)}: a ground is more "
+                f"than {_MANY_PIECES} fixed pieces that a sphere may touch"
             )
         if not pieces:
             raise ValueError("a terrain has at least one piece, but there are none")

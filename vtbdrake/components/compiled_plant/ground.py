@@ -89,7 +89,11 @@ class GroundContact:
         self._set.argtypes, self._set.restype = (c_longlong, c_void_p), None
 
     def terrain(self, pieces: Sequence[Piece], materials: NDArray[np.float64]) -> Terrain:
-        """Return another terrain, which has a number as long as it is there; see the class for the arguments.
+        """Return another terrain, which has a number as long as it is there.
+
+        Args:
+            pieces: The fixed shapes, in the order of their numbers.
+            materials: See the class.
 
         Raises:
             RuntimeError: There are too many terrains.
