@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from tests.compiled.quadruped import surface
 from vtbdrake.compiled import CompiledRollouts, FixedPiece, UnsupportedTestbedError
+from vtbdrake.components.compiled_plant import PlantDynamics
+from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
 from vtbdrake.state.systems import collect
 
 RADIUS = 0.1
@@ -85,6 +88,18 @@ def test_rollouts_on_another_terrain_are_drakes(rollouts: CompiledRollouts, seed
     np.testing.assert_allclose(there.outputs[STATE][0, -1], expected, atol=1e-4)
     assert np.abs(here - expected).max() > 1e-2
     np.testing.assert_array_equal(rollouts().outputs[STATE][0, -1], here)
+
+
+def test_a_ground_is_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Drake counts geometries over all Diagrams of a process: their numbers are no part of the machine code."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for _ in range(2):
+        diagram = ball_on(pieces(4, 0.5))
+        plant = diagram.GetSubsystemByName("plant")
+        context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
+        model = PlantDynamics(plant, plant.CreateDefaultContext())
+        PointContact(plant, model, contact_pairs(plant, context))
+    assert len(list(tmp_path.rglob("ground_*.so"))) == 1
 
 
 def test_numbers_of_terrains_are_used_again(rollouts: CompiledRollouts) -> None:

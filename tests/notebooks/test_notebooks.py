@@ -54,6 +54,7 @@ SHORTER: dict[str, Mapping[str, str]] = {
         "resolution=2.0, coarse=10.0": "resolution=5.0, coarse=15.0",
         "horizon=15.0": "horizon=10.0",
     },
+    "perceived": {},
     "steering": {
         "study.run(rollouts=60": "study.run(rollouts=20",
         '"budget", rollouts=120': '"budget", rollouts=40',

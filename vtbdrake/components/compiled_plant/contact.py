@@ -353,22 +353,21 @@ class PointContact:
         """
         if len(self.grounds) != 1:
             raise UnsupportedPlantError(
-                f"a terrain replaces the only ground of a plant, and this one has {len(self.grounds)}: a ground is more "
-                f"than {_MANY_PIECES} fixed pieces that a sphere may touch"
+                f"a terrain replaces the only ground of a plant, and this one has {len(self.grounds)}: a ground is "
+                f"more than {_MANY_PIECES} fixed pieces that a sphere may touch"
             )
         if not pieces:
             raise ValueError("a terrain has at least one piece, but there are none")
         (ground,), (kernel,) = self.grounds, self._kernels
         sample = ground.pieces[0]
         others = []
-        for k, piece in enumerate(pieces):
+        for piece in pieces:
             if not isinstance(piece.shape, Box | Convex):
                 raise ValueError(f"a piece of terrain is a Box or a Convex, not a {type(piece.shape).__name__}")
             vertices = np.zeros((0, 3)) if isinstance(piece.shape, Box) else _hull(piece.shape.GetConvexHull())
             others.append(
                 replace(
                     sample,
-                    geometry=sample.geometry + k,
                     shape=piece.shape,
                     X_BG=piece.X_WP,
                     friction=piece.friction,

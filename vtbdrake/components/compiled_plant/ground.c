@@ -3,8 +3,7 @@
 A grid over the map tells which shapes may lie under a sphere. Contact with a box has a closed form, with a hull it is
 Drake's iteration.
 
-The text before both defines NAME and SET: names of functions; NF: the number of spheres; RADIUS[NF] (m); SPHERE_ID[NF];
-SLOTS: the most contacts of a sphere; MOST_TERRAINS; and the arrays of one terrain, of N shapes, that is number 0. Other
+The text before both defines NAME and SET: names of functions; NF: the number of spheres; RADIUS[NF] (m); SPHERE_ID[NF]; SLOTS: the most contacts of a sphere; MOST_TERRAINS; and the arrays of one terrain, of N shapes, that is number 0. Other
 terrains are data: SET gives them a number, or takes it away again.
 
 Arguments: the rotations of the spheres in the world (3, 3 NF) by columns, their centres (3, NF, m), and the number of the
@@ -13,8 +12,8 @@ the shape (3), the point of contact less the centre of the sphere (3, m), in the
 and a doubt: 1 where a sphere has more contacts, or no terrain has the number, else 0. */
 
 /* For each shape n: IS_BOX, HALF (m, of a box), POSE: its rotation by columns and its position (m), CENTER (m, in its
-frame), REACH: the largest distance from the center (m), LOW and HIGH: its box in the world (m), ID: Drake's number of the
-geometry, which tells which shape comes first; the vertices VERTICES[FIRST[n]] to VERTICES[FIRST[n + 1] - 1] (m, in its
+frame), REACH: the largest distance from the center (m), LOW and HIGH: its box in the world (m), ID: the rank of
+Drake's number of the geometry, which tells which shape comes first; the vertices VERTICES[FIRST[n]] to VERTICES[FIRST[n + 1] - 1] (m, in its
 frame); MATERIALS[f N + n] of the sphere f: stiffness (N/m), dissipation, friction, and the share of the sphere in the
 stiffness. The grid: ORIGIN and CELL (m), NX NY cells, and the shapes CELL_SHAPES[CELL_FIRST[c]] to
 CELL_SHAPES[CELL_FIRST[c + 1] - 1] of the cell c = ix + NX iy. */

@@ -69,12 +69,15 @@ class GroundContact:
         self, spheres: Sequence[tuple[int, Sphere]], pieces: Sequence[Piece], materials: NDArray[np.float64]
     ) -> None:
         self._radius = max(sphere.radius() for _, sphere in spheres)
+        # Drake counts geometries over all Diagrams of a process; their order alone matters.
+        numbers = sorted({*(number for number, _ in spheres), *(piece.geometry for piece in pieces)})
+        self._ranks = {number: rank for rank, number in enumerate(numbers)}
         text = "".join(
             (
                 f"#define NF {len(spheres)}\n#define SLOTS {SLOTS}\n#define MOST_TERRAINS {_MOST_TERRAINS}\n",
                 _array("double RADIUS", [sphere.radius() for _, sphere in spheres]),
-                _array("long long SPHERE_ID", [number for number, _ in spheres]),
-                _source(_arrays(pieces, materials, self._radius)),
+                _array("long long SPHERE_ID", [self._ranks[number] for number, _ in spheres]),
+                _source(self._arrays(pieces, materials)),
                 *(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in ("mpr.c", "ground.c")),
             )
         )
@@ -92,13 +95,16 @@ class GroundContact:
         """Return another terrain, which has a number as long as it is there.
 
         Args:
-            pieces: The fixed shapes, in the order of their numbers.
+            pieces: The fixed shapes, each with the number of a piece of terrain 0.
             materials: See the class.
 
         Raises:
             RuntimeError: There are too many terrains.
         """
-        return Terrain(self._name, self._set, _arrays(pieces, materials, self._radius))
+        return Terrain(self._name, self._set, self._arrays(pieces, materials))
+
+    def _arrays(self, pieces: Sequence[Piece], materials: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+        return _arrays(pieces, materials, [self._ranks[piece.geometry] for piece in pieces], self._radius)
 
 
 class Terrain:
@@ -158,7 +164,9 @@ def _release(assign: Callable[[int, Any], None], number: int, taken: set[int]) -
         taken.discard(number)
 
 
-def _arrays(pieces: Sequence[Piece], materials: NDArray[np.float64], radius: float) -> dict[str, NDArray[Any]]:
+def _arrays(
+    pieces: Sequence[Piece], materials: NDArray[np.float64], ranks: Sequence[int], radius: float
+) -> dict[str, NDArray[Any]]:
     """Return the arrays of the struct Terrain of ground.c by name, with ``origin``, ``cell`` and ``cells``."""
     corners = [piece.corners for piece in pieces]
     in_world = [each @ piece.R.T + piece.p for each, piece in zip(corners, pieces, strict=True)]
@@ -169,7 +177,7 @@ def _arrays(pieces: Sequence[Piece], materials: NDArray[np.float64], radius: flo
     is_box = np.array([isinstance(piece.shape, Box) for piece in pieces])
     half = [piece.shape.size() / 2 if isinstance(piece.shape, Box) else np.zeros(3) for piece in pieces]
     return {
-        "id": np.array([piece.geometry for piece in pieces], dtype=np.int64),
+        "id": np.array(ranks, dtype=np.int64),
         "is_box": is_box.astype(np.int64),
         "first": np.cumsum([0, *map(len, corners)], dtype=np.int64),
         "half": np.array(half),
