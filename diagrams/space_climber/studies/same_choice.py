@@ -54,7 +54,7 @@ class Choices:
 
     @property
     def loss(self) -> float:
-        """Return by how much Drake's rollout of the compiled choice is worse than that of its own choice, in m."""
+        """Return by how much the compiled choice is worse than Drake's by Drake's own rollouts, in m."""
         if self.compiled.chosen is None or self.drake.chosen is None:
             return 0.0 if self.is_same else np.inf
         candidates = self.drake.candidates
