@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +38,51 @@ def commanded(rng: np.random.Generator, times: NDArray[np.float64]) -> NDArray[n
     return np.sum(waves, axis=0) * (1.0 - np.exp(-times / 0.1))
 
 
-def recorded(
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion of the pendulum.
+
+    Attributes:
+        times: (n,), in s.
+        torques: The commanded torques, (n,), in N m.
+        positions: The true angles, (n,), in rad.
+        velocities: Their rates, (n,), in rad/s.
+        rng: The generator after the motion was drawn.
+    """
+
+    times: NDArray[np.float64]
+    torques: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    rng: np.random.Generator
+
+    def log(self, *, offset: float = 0.0) -> Log:
+        """Return the log of the motion, with noise of 0.2 mrad.
+
+        Args:
+            offset: What the encoder shows at zero, in rad.
+        """
+        measured = self.positions + offset + 2e-4 * self.rng.normal(size=self.times.size)
+        columns = {"time": self.times, "q": measured, "u": self.torques}
+        return read_table(columns, sense={"position": "q"}, act={"torque": "u"})
+
+
+def recorded(law: str = "Coulomb", *, seed: int, offset: float = 0.0, **options: float) -> Log:
+    """Return a log of the pendulum, with noise of 0.2 mrad.
+
+    Args:
+        law: As in `moved`.
+        seed: Seed of motion and noise.
+        offset: What the encoder shows at zero, in rad.
+        **options: Further arguments of `moved`.
+    """
+    return moved(law, seed=seed, **options).log(offset=offset)
+
+
+def moved(
     law: str = "Coulomb",
     *,
     seed: int,
-    offset: float = 0.0,
     disturbance: float = 0.0,
     seconds: float = 8.0,
     center: float = CENTER,
@@ -49,15 +90,14 @@ def recorded(
     coulomb: float = 0.0,
     amplitude: float = 1.0,
     step: float = 4e-4,
-) -> Log:
-    """Return a log of the pendulum, with noise of 0.2 mrad.
+) -> Motion:
+    """Return a motion of the pendulum.
 
     Each step takes the friction implicitly: it never turns the velocity around.
 
     Args:
         law: Name of the friction's law.
         seed: Seed of motion and noise.
-        offset: What the encoder shows at zero, in rad.
         disturbance: Deviation of a torque that is not in the log, in N m; it is correlated over 50 ms.
         seconds: Duration.
         center: Distance of the centre of mass from the joint, in m.
@@ -75,14 +115,14 @@ def recorded(
     acting = torques + disturbance * walk
     inertia = moment + MASS * center**2
     q = v = 0.0
-    positions = []
+    states = []
     for k in range(times.size):
-        positions.append(q)
+        states.append((q, v))
         torque = acting[k - 1] if k else 0.0  # A command acts a period later, as with the testbed's drives.
         for _ in range(round(PERIOD / step)):
             free = v + step * (torque - VISCOUS * v - MASS * GRAVITY * center * np.sin(q)) / inertia
             friction = coulomb + LAWS[law](v, torque)
             v = np.sign(free) * max(abs(free) - step * friction / inertia, 0.0)
             q += step * v
-    measured = np.array(positions) + offset + 2e-4 * rng.normal(size=times.size)
-    return read_table({"time": times, "q": measured, "u": torques}, sense={"position": "q"}, act={"torque": "u"})
+    positions, velocities = np.array(states).T
+    return Motion(times, torques, positions, velocities, rng)

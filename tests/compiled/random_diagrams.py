@@ -221,6 +221,8 @@ class RandomDiagram:
                 time_constant=0.02,
                 viscous=0.1,
                 coulomb=0.05,
+                disturbance=float(self.random.choice([0.0, 0.2])),
+                seed=int(self.random.integers(5)),
                 delay=int(self.random.integers(0, 3)),
                 max_delay=3,
             )

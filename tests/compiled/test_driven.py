@@ -68,6 +68,21 @@ def test_follows_the_log_as_in_drake(name: str) -> None:
     assert np.ptp(batch.outputs["plant.state"][:, -1], axis=0).max() > 1e-3
 
 
+@pytest.mark.parametrize("time_step", [0.002, 0.001])
+def test_disturbed_drives_are_as_in_drake(time_step: float) -> None:
+    """The drives' period is 2 ms, and their friction is computed at the plant's step."""
+    plant = MultibodyPlantConfig(time_step=time_step, discrete_contact_approximation="sap")
+    scenario = DrivenScenario(scenario=DoublePendulumScenario(plant_config=plant, period=0.002), log=PENDULUM)
+    address, values, outputs = "sim.act.drives.disturbance[1]", [0.0, 0.3], ["plant.state"]
+    rollouts = scenario.build().compiled(
+        horizon=0.15, sample_period=0.01, parameters=[address], outputs=outputs, compile=False
+    )
+    batch = rollouts({address: values})
+    expected = in_drake(scenario, address, values, outputs)["plant.state"]
+    np.testing.assert_allclose(batch.outputs["plant.state"], expected, rtol=1e-10, atol=1e-10)
+    assert abs(expected[1] - expected[0]).max() > 1e-3
+
+
 def test_a_later_begin_reads_the_later_samples() -> None:
     scenario = DRIVEN["pendulum"][0]
     testbed = scenario.build()

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from vtbdrake.common.arrays import Array
 
 if TYPE_CHECKING:
-    from vtbdrake.calibration.filtering import Innovations
+    from vtbdrake.calibration.filtering import Innovations, Noise
     from vtbdrake.calibration.fisher import Information
+    from vtbdrake.calibration.joint_model import JointModel
 
 _BLOCK = 0.2  # s, block length of the sandwich estimator
 
@@ -45,3 +46,22 @@ def block_scores(slopes: Array, white: Array, period: float) -> Array:
     spans = [slice(k, k + length) for k in range(0, steps - length + 1, length)]
     scores = [np.einsum("twij,twi->wj", slopes[span], white[span]) for span in spans]
     return np.concatenate(scores)
+
+
+def torque_disturbances(model: JointModel, noise: Noise) -> dict[str, float]:
+    """Return the torque disturbances of a calibration as numbers of its `JointDrives`, by address.
+
+    Joints without a drive take none, and a testbed without `JointDrives` has none at all.
+
+    Args:
+        model: The model that was fitted.
+        noise: The noise that explains its innovations.
+    """
+    if not model.drives:
+        return {}
+    deviations = {
+        f"{model.drives}.disturbance[{actuator}]": float(noise.torque[joint])
+        for joint, actuator in enumerate(model.actuator_of)
+        if actuator >= 0
+    }
+    return deviations | {f"{model.drives}.disturbance_time": noise.correlation_time}

@@ -315,18 +315,32 @@ class ContactEquations(SensorEquations):
 
 
 class DriveEquations(Equations):
-    """`JointDrives`, whose delay is compiled in."""
+    """`JointDrives`, whose delay is compiled in; a disturbance that is 0 is left out."""
 
     def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
         super().__init__(system, context, varied)
-        self._delay = round(float(context.get_numeric_parameter(0).value()[-1]))
+        self.timing = Timing(system.period)
+        self._vector = system.settings.vector
+        values = context.get_numeric_parameter(0).value()
+        self._delay = round(float(values[-1]))
+        self._is_disturbed = "disturbance" in varied or bool(values[self._vector.slice_of("disturbance")].any())
+        if self._is_disturbed:
+            self.draws["disturbance"] = Draw(system.n, (0, self._vector.slice_of("seed").start), self._noise)
+
+    def _noise(self, seeds: Array, times: Array) -> Array:
+        system: Any = self.system
+        ticks = np.rint(times / system.period).astype(np.int64)
+        return noise_of_seeds(system.n, seeds=seeds.astype(np.uint64), stream=system.stream(), ticks=ticks)
 
     def fixed(self) -> Iterator[Fixed]:
         yield Fixed(0, slice(-1, None), "a delay is compiled in")
+        if not self._is_disturbed:
+            place = self._vector.slice_of("disturbance")
+            yield Fixed(0, place, "it is 0, and left out: name it in parameters=")
 
     def output(self, port: str, at: At) -> Expression:
         system: Any = self.system
-        return self._torque(at, at.state(1)[: system.n]) if system.step > 0.0 else at.state(0)
+        return self._torque(at, at.state(1)) if system.step > 0.0 else at.state(0)
 
     def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int, Expression]]]]:
         system: Any = self.system
@@ -337,8 +351,9 @@ class DriveEquations(Equations):
         else:
             yield when, self._all
 
-    def _torque(self, at: At, motor: Expression) -> Expression:
-        arguments = [at.parameter(0), motor, at.state(0), at.state(2), at.input("state")]
+    def _torque(self, at: At, memory: Expression) -> Expression:
+        n = self.system.n
+        arguments = [at.parameter(0), memory[:n], memory[-n:], at.state(0), at.state(2), at.input("state")]
         return casadi.densify(self.system.kernel.expression(arguments))
 
     def _last(self, at: At, torque: Expression) -> dict[int, Expression]:
@@ -348,16 +363,26 @@ class DriveEquations(Equations):
         system: Any = self.system
         delayed = u = at.input("command")
         n, memory = system.n, at.state(1)
-        in_transit = memory[2 * n :]
+        in_transit = memory[2 * n : -n]
         if self._delay:
             delayed = in_transit[(self._delay - 1) * n : self._delay * n]
         following = system.motors.expression([at.parameter(0), memory[: 2 * n], delayed])
         shifted = casadi.vertcat(u, in_transit[:-n]) if system.max_delay else casadi.SX(0, 1)
-        return {1: casadi.vertcat(following, shifted)}
+        return {1: casadi.vertcat(following, shifted, self._disturbing_torque(at, memory[-n:]))}
+
+    def _disturbing_torque(self, at: At, before: Expression) -> Expression:
+        if not self._is_disturbed:
+            return casadi.SX.zeros(before.numel(), 1)
+        system: Any = self.system
+        values = at.parameter(0)
+        deviation, time = (values[self._vector.slice_of(name)] for name in ("disturbance", "disturbance_time"))
+        # The division by 0 gives exp(-inf) = 0.
+        decay = casadi.if_else(at.state(2)[-1] > 0.5, casadi.exp(-system.period / time), 0.0)
+        return decay * before + casadi.sqrt(1.0 - decay**2) * deviation * at.draw("disturbance")
 
     def _all(self, at: At) -> dict[int, Expression]:
         following = self._motors(at)
-        return {**following, **self._last(at, self._torque(at, following[1][: self.system.n]))}
+        return {**following, **self._last(at, self._torque(at, following[1]))}
 
 
 class CandidateEquations(Equations):

@@ -38,6 +38,11 @@ class Posterior:
     covariance: list[list[float]] = setting(default_factory=list, doc="Its covariance.")
     lower: list[float] = setting(default_factory=list, doc="The least single numbers.")
     upper: list[float] = setting(default_factory=list, doc="The largest single numbers.")
+    disturbances: dict[str, float] = setting(
+        default_factory=dict,
+        doc="What nothing in the model explains: deviations and correlation time of random torques, by address.",
+    )
+    seed: str = setting("", "The address of the seed of these torques.")
 
 
 @dataclass(kw_only=True, repr=False)

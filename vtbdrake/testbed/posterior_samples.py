@@ -11,15 +11,18 @@ from vtbdrake.testbed.scenario_identity import ScenarioError
 
 # The largest number of draws for one sample: one outside the ranges is drawn again.
 _DRAWS = 1000
+# The number of seeds that are drawn from.
+_SEEDS = 2**31
 
 
-def samples(posterior: Posterior, count: int, *, seed: int) -> list[dict[str, float]]:
+def samples(posterior: Posterior, count: int, *, seed: int, disturbances: bool) -> list[dict[str, float]]:
     """Return samples, address -> value; see `Scenario.samples`.
 
     Args:
         posterior: The joint distribution of the numbers.
         count: Number of samples.
         seed: Determines the samples; the first ones of a larger number are the same.
+        disturbances: Whether each sample has the random torques of the recordings, with a seed.
 
     Raises:
         ScenarioError: The posterior is empty, or its ranges hold next to nothing of it.
@@ -30,7 +33,11 @@ def samples(posterior: Posterior, count: int, *, seed: int) -> list[dict[str, fl
     values, axes = np.linalg.eigh(np.array(posterior.covariance).reshape(mean.size, mean.size))
     root = axes * np.sqrt(np.maximum(values, 0.0))
     generator = np.random.default_rng(seed)
-    return [_physical(posterior, _drawn(posterior, mean, root, generator)) for _ in range(count)]
+    numbers = [_physical(posterior, _drawn(posterior, mean, root, generator)) for _ in range(count)]
+    if not (disturbances and posterior.disturbances):
+        return numbers
+    seeds = [float(np.random.default_rng([seed, k]).integers(_SEEDS)) for k in range(count)]
+    return [each | posterior.disturbances | {posterior.seed: s} for each, s in zip(numbers, seeds, strict=True)]
 
 
 def _drawn(posterior: Posterior, mean: Array, root: Array, generator: np.random.Generator) -> Array:

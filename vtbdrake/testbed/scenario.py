@@ -363,15 +363,20 @@ class Scenario(ABC):
         changed.validate()
         return changed
 
-    def samples(self, count: int, *, seed: int = 0) -> list[dict[str, float]]:
+    def samples(self, count: int, *, seed: int = 0, disturbances: bool = True) -> list[dict[str, float]]:
         """Return samples of the numbers that were calibrated, as they vary together: address -> value.
 
         They are conditions of a `Problem`, values for `VirtualTestbed.write`, and other scenarios by `with_values`.
         Every sample of an inertia is one of a body. Combinations that the recordings did not tell keep their estimate.
 
+        The recordings also show how far a machine departs from the model with the right numbers: so each sample lets
+        the scenario's `JointDrives` disturb their joints at random, with the deviation and the correlation time of the
+        calibration, and a seed. What is predicted with samples is then as uncertain as it is.
+
         Args:
             count: Number of samples.
             seed: Determines the samples; the first ones of a larger number are the same.
+            disturbances: False: the numbers alone vary, as where a simulated machine has disturbances of its own.
 
         Raises:
             ScenarioError: Nothing was calibrated.
@@ -385,7 +390,7 @@ class Scenario(ABC):
                 f"than to the truth: {'; '.join(self.pedigree.reasons)}",
                 stacklevel=2,
             )
-        return samples(self.pedigree.posterior, count, seed=seed)
+        return samples(self.pedigree.posterior, count, seed=seed, disturbances=disturbances)
 
     def save(self, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:
         """Write a YAML file that `load_scenario` reads, and the model's validity domain beside it.

@@ -113,6 +113,27 @@ def test_friction_does_not_pass_the_current_loop() -> None:
     )
 
 
+def test_disturbance_has_its_deviation_and_correlation_time() -> None:
+    """An Ornstein-Uhlenbeck process, from the first period on."""
+    y = torques(3000, u=lambda k: [0.0, 0.0], disturbance=[0.5, 0.0], disturbance_time=0.005, seed=3)
+    assert not y[:, 1].any()
+    d = y[:, 0]
+    # 3 s have 300 independent pieces of 2 T: the deviation is known to 4 %.
+    assert d.std() == pytest.approx(0.5, rel=0.12)
+    for lag in (1, 5):
+        correlation = d[lag:] @ d[:-lag] / (d @ d)
+        assert correlation == pytest.approx(np.exp(-lag * PERIOD / 0.005), abs=0.12)
+    starts = [torques(1, u=lambda k: [0.0, 0.0], disturbance=0.5, seed=seed)[0] for seed in range(30)]
+    assert np.std(starts) == pytest.approx(0.5, rel=0.3)
+
+
+def test_disturbance_is_the_same_for_the_same_seed() -> None:
+    drive = {"disturbance": 0.5, "viscous": 0.1}
+    first, again, other = (torques(5, seed=seed, **drive) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
+
+
 def test_every_value_is_a_variable() -> None:
     _, plant = two_joints()
     drives = JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], period=PERIOD, max_delay=3)
@@ -122,6 +143,7 @@ def test_every_value_is_a_variable() -> None:
         "motor_torque",
         "reference",
         "in_transit",
+        "disturbing_torque",
         "last_velocity",
         "has_last",
         "limit",
@@ -133,7 +155,10 @@ def test_every_value_is_a_variable() -> None:
         "stribeck_velocity",
         "load_friction",
         "asymmetry",
+        "disturbance",
         "inertia",
+        "disturbance_time",
+        "seed",
         "time_constant",
         "delay",
     ]
@@ -145,7 +170,9 @@ def test_every_value_is_a_variable() -> None:
         ({"limit": -1.0}, "limit must not be negative"),
         ({"viscous": [0.0, np.nan]}, "viscous must not be negative or NaN"),
         ({"load_friction": -0.1}, "load_friction must not be negative"),
+        ({"disturbance": [1.0, -1.0]}, "disturbance must not be negative"),
         ({"delay": 1.5}, "whole number of periods"),
+        ({"seed": 0.5}, "seed is a whole number"),
         ({"period": 0.0}, "period must be positive"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf, pi
+from math import exp, inf, pi, sqrt
 from typing import TYPE_CHECKING
 
 import casadi
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel, clamp
+from vtbdrake.components.sensors.noise import normal_noise, random_stream
 from vtbdrake.state import AddressedSystem, Quantity
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ class JointDrives(AddressedSystem):
 
         r_k = clip(u_{k-delay}, +- limit), no further than rate T from r_{k-1}          (amplifier)
         m_k = m_{k-1} + (1 - exp(-T / time_constant)) (r_k - m_{k-1})                   (current loop)
-        torque_k = m_k - friction(w)                                                    (friction in gear and bearings)
+        d_k = r d_{k-1} + sqrt(1 - r^2) disturbance n_k,  r = exp(-T / disturbance_time)    (what no model explains)
+        torque_k = m_k + d_k - friction(w)                                              (friction in gear and bearings)
         friction = viscous w + asymmetry + tanh(w / coulomb_velocity)
                    (coulomb + stribeck exp(-(v_k / stribeck_velocity)^2) + load_friction |m_k|)
         w = 2 v_k - v_{k-1} + T / inertia (torque_k - torque_{k-1})
@@ -62,8 +64,11 @@ class JointDrives(AddressedSystem):
     ``asymmetry`` in positive direction, and smaller in negative one; these are 0 by default. It is smooth: a joint at
     rest under a load below ``coulomb`` creeps, slower than ``coulomb_velocity``.
 
+    The disturbance is random: n_k of N(0, 1) is a function of ``seed``, the system's name and k, and d_0 = disturbance
+    n_0. It is 0 by default. Samples of a calibrated scenario have the one that its recordings showed.
+
     A continuous plant feels torque_k for a period. A discrete plant feels its friction from its own step on, with that
-    step as T, and the motor's torque m_{k-1} as state: a command that is itself a state of period T is read one period
+    step as T, and m_{k-1} and d_{k-1} as state: a command that is itself a state of period T is read one period
     after it was set, and felt by a discrete plant of that period from then on.
 
     All values are parameters of the Context, by address; ``delay`` counts whole periods, up to ``max_delay``.
@@ -85,6 +90,9 @@ class JointDrives(AddressedSystem):
         stribeck_velocity: ArrayLike = 0.1,
         load_friction: ArrayLike = 0.0,
         asymmetry: ArrayLike = 0.0,
+        disturbance: ArrayLike = 0.0,
+        disturbance_time: float = 0.05,
+        seed: int = 0,
         delay: int = 0,
         max_delay: int = 0,
         initial: ArrayLike = 0.0,
@@ -105,6 +113,9 @@ class JointDrives(AddressedSystem):
             stribeck_velocity: Velocity scale of the friction near rest in rad/s; a scalar or shape (n,).
             load_friction: Friction per torque of the motor; a scalar or shape (n,).
             asymmetry: Torque in N m against positive motion, which helps negative motion; a scalar or shape (n,).
+            disturbance: Standard deviation of a random torque in N m; a scalar or shape (n,).
+            disturbance_time: Correlation time of that torque in seconds.
+            seed: Seed of that torque.
             delay: Delay of the command in whole periods.
             max_delay: The largest delay that can be set in the Context, in whole periods; at least ``delay``.
             initial: The torque in N m before the first sample, both commanded and reached; a scalar or shape (n,).
@@ -117,11 +128,13 @@ class JointDrives(AddressedSystem):
         n = len(joints)
         by_joint = (
             limit, rate, viscous, coulomb, coulomb_velocity, stribeck, stribeck_velocity, load_friction, asymmetry,
+            disturbance,
         )  # fmt: skip
         numbers = zip(_UNITS, by_joint, strict=True)
         entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in numbers}
         self.max_delay = max(int(delay), int(max_delay))
-        _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
+        times = {"time_constant": np.array(time_constant), "disturbance_time": np.array(disturbance_time)}
+        _check(period, {**entries, **times, "seed": np.array(seed), "delay": np.array(delay)})
         self.period: float = float(period)  # sample period T in seconds
         self.n = n  # number of joints
         self.entry_names = tuple(joint.name() for joint in joints)
@@ -133,17 +146,21 @@ class JointDrives(AddressedSystem):
         memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
         if self.max_delay:
             memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
+        memory["disturbing_torque"] = Quantity(np.zeros(n), "N m")
         self._memory = self.declare_discrete_state(**memory)
         # The velocities one period before, and 1 if there are some.
         self._last = self.declare_discrete_state(
             last_velocity=Quantity(np.zeros(n), "rad/s"), has_last=Quantity(0.0, "1")
         )
-        self._settings = self.declare_parameters(
+        self.settings = self.declare_parameters(
             **{name: Quantity(value, _UNITS[name], (_lowest(name), inf)) for name, value in entries.items()},
             inertia=Quantity(least_inertia(plant, joints), "kg m^2", (0.0, inf)),
+            disturbance_time=Quantity(disturbance_time, "s", (0.0, inf)),
+            seed=Quantity(seed, bounds=(0.0, 2.0**53)),
             time_constant=Quantity(time_constant, "s", (0.0, inf)),
             delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
+        self.stream = random_stream(self, None)  # function that returns the random stream
         self.velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]  # places in [q; v]
         self.step: float = float(plant.time_step())  # step in s of a discrete plant, 0 of a continuous one
         self.motors = _motors(n, self.period)
@@ -173,16 +190,18 @@ class JointDrives(AddressedSystem):
         """
         torque = np.asarray(command, dtype=float)
         context.SetDiscreteState(self._torque.index, torque)
-        context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self.max_delay))
+        memory = [np.tile(torque, 2 + self.max_delay), np.zeros(self.n)]
+        context.SetDiscreteState(self._memory.index, np.concatenate(memory))
         context.SetDiscreteState(self._last.index, np.zeros(self.n + 1))
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._torque_with(context, self._memory.array(context)[: self.n]))
+        output.SetFromVector(self._torque_with(context, self._memory.array(context)))
 
-    def _torque_with(self, context: Context, motor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the torques that the joints feel with the torques ``motor`` of their motors, each (n,)."""
-        settings, before, last = (group.array(context) for group in (self._settings, self._torque, self._last))
-        return self.kernel.value((settings, motor, before, last, self._state_port.Eval(context)))
+    def _torque_with(self, context: Context, memory: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the torques (n,) that the joints feel with the torques of motors and disturbances in ``memory``."""
+        settings, before, last = (group.array(context) for group in (self.settings, self._torque, self._last))
+        motor, disturbance = memory[: self.n], memory[-self.n :]
+        return self.kernel.value((settings, motor, disturbance, before, last, self._state_port.Eval(context)))
 
     def _remember(self, context: Context, state: DiscreteValues) -> None:
         self._set_last(context, state, self.get_output_port().Eval(context))
@@ -195,20 +214,33 @@ class JointDrives(AddressedSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self.n
-        settings, memory = self._settings.array(context), self._memory.mutable_array(state)
+        settings, memory = self.settings.array(context), self._memory.mutable_array(state)
         delayed = u = self._command.Eval(context)
         if self.max_delay:
             in_transit = self._memory.vector.view(memory).in_transit
-            if delay := round(self._settings.vector.view(settings).delay):
+            if delay := round(self.settings.vector.view(settings).delay):
                 delayed = in_transit[delay - 1].copy()
             in_transit[1:] = in_transit[:-1]
             in_transit[0] = u
         memory[: 2 * n] = self.motors.value((settings, memory[: 2 * n], delayed))
+        memory[-n:] = self._disturbing_torque(context, memory[-n:])
+
+    def _disturbing_torque(self, context: Context, before: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the random torques d_k, (n,), after d_{k-1}."""
+        settings = self.settings.view(context)
+        if not settings.disturbance.any():
+            return np.zeros(self.n)
+        tick = round(context.get_time() / self.period)
+        noise = normal_noise(self.n, seed=int(settings.seed), stream=self.stream(), tick=tick)
+        decay = exp(-self.period / settings.disturbance_time) if settings.disturbance_time > 0.0 else 0.0
+        if not self._last.view(context).has_last:  # It begins with what it is in the mean.
+            decay = 0.0
+        following: NDArray[np.float64] = decay * before + sqrt(1.0 - decay**2) * settings.disturbance * noise
+        return following
 
     def _update_all(self, context: Context, state: DiscreteValues) -> None:
         self._update(context, state)
-        motor = self._memory.mutable_array(state)[: self.n]
-        self._set_last(context, state, self._torque_with(context, motor))
+        self._set_last(context, state, self._torque_with(context, self._memory.mutable_array(state)))
 
 
 # Numbers that each joint has, in the order of the parameters.
@@ -222,8 +254,9 @@ _UNITS = {
     "stribeck_velocity": "rad/s",
     "load_friction": "1",
     "asymmetry": "N m",
+    "disturbance": "N m",
 }
-FRICTION = tuple(name for name in _UNITS if name not in ("limit", "rate"))
+FRICTION = tuple(name for name in _UNITS if name not in ("limit", "rate", "disturbance"))
 """The numbers of the friction's law."""
 
 
@@ -296,7 +329,9 @@ def _motors(n: int, period: float) -> Kernel:
 
 
 def _friction(velocities: Sequence[int], states: int, period: float, is_discrete: bool) -> Kernel:
-    """Return the torques at the joints as a kernel of (parameters, m_k, torque_{k-1}, [v_{k-1}; has_last], [q; v]).
+    """Return the torques at the joints as a kernel.
+
+    It is one of (parameters, m_k, d_k, torque_{k-1}, [v_{k-1}; has_last], [q; v]).
 
     Args:
         velocities: The places of the joints' velocities in [q; v].
@@ -306,15 +341,16 @@ def _friction(velocities: Sequence[int], states: int, period: float, is_discrete
             middle of a period.
     """
     n = len(velocities)
-    sizes = _sizes(n, values=None, motor=n, before=n, last=n + 1, x=states)
-    values, motor, before, last, x = (casadi.SX.sym(name, size) for name, size in sizes)
+    sizes = _sizes(n, values=None, motor=n, disturbance=n, before=n, last=n + 1, x=states)
+    values, motor, disturbance, before, last, x = (casadi.SX.sym(name, size) for name, size in sizes)
     law = _by_joint(values, n)
     v, viscous, asymmetry = x[velocities], law["viscous"], law["asymmetry"]
     edge, size = casadi.fmax(law["coulomb_velocity"], _LEAST_EDGE), friction_size(v, motor, law)
     g = period / casadi.fmax(law["inertia"], _LEAST_EDGE)
     # The end velocity without friction, less what does not depend on it: a w + b tanh(w / edge) = rest.
     share = 1.0 if is_discrete else 0.5
-    free = 2.0 * v - last[:n] + g * (motor - before)
+    driving = motor + disturbance
+    free = 2.0 * v - last[:n] + g * (driving - before)
     rest = free - g * asymmetry - (1.0 - share) * g * viscous * v
     a, b = 1.0 + share * g * viscous, g * size
     passed = casadi.SX.zeros(n)
@@ -328,8 +364,8 @@ def _friction(velocities: Sequence[int], states: int, period: float, is_discrete
     w = casadi.if_else(last[n] > 0.5, w, v)
     passed = casadi.if_else(last[n] > 0.5, passed, 0.0)
     direction = passed * casadi.tanh(v / edge) + (1.0 - passed) * casadi.tanh(w / edge)
-    torque = motor - (viscous * (share * w + (1.0 - share) * v) + size * direction + asymmetry)
-    return Kernel("friction", [values, motor, before, last, x], torque, compile=False)
+    torque = driving - (viscous * (share * w + (1.0 - share) * v) + size * direction + asymmetry)
+    return Kernel("friction", [values, motor, disturbance, before, last, x], torque, compile=False)
 
 
 def end_velocity(a: Expression, b: Expression, rest: Expression, edge: Expression) -> Expression:
@@ -352,12 +388,12 @@ def end_velocity(a: Expression, b: Expression, rest: Expression, edge: Expressio
 
 def _sizes(n: int, **sizes: int | None) -> list[tuple[str, int]]:
     """Return names and sizes of the arguments of a kernel; None stands for all parameters."""
-    every = (len(_UNITS) + 1) * n + 2
+    every = (len(_UNITS) + 1) * n + 4
     return [(name, every if size is None else size) for name, size in sizes.items()]
 
 
 def _by_joint(values: Expression, n: int) -> dict[str, Expression]:
-    return dict(zip([*_UNITS, "inertia"], casadi.vertsplit(values[:-2], n), strict=True))
+    return dict(zip([*_UNITS, "inertia"], casadi.vertsplit(values[:-4], n), strict=True))
 
 
 def _check_joints(joints: Sequence[Joint]) -> None:
@@ -375,5 +411,6 @@ def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:
     for name, value in values.items():
         if np.isnan(value).any() or (value < _lowest(name)).any():
             raise ValueError(f"JointDrives: {name} must not be negative or NaN, but is {value.tolist()}")
-    if values["delay"] != np.round(values["delay"]):
-        raise ValueError(f"JointDrives: delay is a whole number of periods, not {values['delay']}")
+    for name, unit in (("delay", " of periods"), ("seed", "")):
+        if values[name] != np.round(values[name]):
+            raise ValueError(f"JointDrives: {name} is a whole number{unit}, not {values[name]}")
