@@ -17,7 +17,7 @@ from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques
-from vtbdrake.calibration.missing_terms import lost_friction, missing_terms, named_terms, widening
+from vtbdrake.calibration.missing_terms import lost_friction, missing_terms
 from vtbdrake.calibration.posterior import sandwich_covariance, torque_disturbances
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
@@ -70,8 +70,7 @@ class Calibrated:
         address: Its address.
         start: Its value in the scenario.
         value: Its estimate.
-        deviation: Its standard deviation, by the sandwich estimator over blocks of 0.2 s, widened by what terms would
-            change that the model may lack.
+        deviation: Its standard deviation, by the sandwich estimator over blocks of 0.2 s.
         lower, upper: Its interval of 95 %, within its range. At a bound it is the profile of the likelihood, one-sided.
         verdict: Whether it may be used.
     """
@@ -439,9 +438,6 @@ def _result(
         raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
     sandwich = sandwich_covariance(innovations, used, segments.period, info)
     gradient = (J * model.scales).T @ white[:, used].ravel()
-    deviations = np.sqrt(np.diag(sandwich)) * model.scales
-    terms = missing_terms(segments, linearized, noise, z, used, info)
-    sandwich = sandwich + widening(terms)
     bounds = _Bounds(model, z, gradient, info, np.diag(sandwich))
     correlation = _autocorrelation(white[:, used])
     reasons = [*prepared.doubts, *bounds.reasons]
@@ -449,8 +445,9 @@ def _result(
         reasons.append(f"the innovations are coloured (autocorrelation {correlation:.2g}): the model lacks something")
     if _is_worse(white, used):
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
+    deviations = np.sqrt(np.diag(sandwich)) * model.scales
     reasons += lost_friction(segments, prepared.start, z, noise, deviations)
-    reasons += map(str, named_terms(terms))
+    reasons += map(str, missing_terms(segments, linearized, noise, z, used, info))
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
         verdict = Verdict.NO_EVIDENCE
@@ -464,17 +461,7 @@ def _result(
         reasons.append(f"no testbed takes the estimates: {error}")
         verdict = Verdict.DISCREPANT
         results = _reported(model, z, sandwich, info, bounds, verdict)
-    n = model.scalars
-    posterior = Posterior(
-        addresses=model.names[:n],
-        inertias=list(model.bodies),
-        mean=z.tolist(),
-        covariance=(0.5 * (covariance + covariance.T)).tolist(),
-        lower=model.lower[:n].tolist(),
-        upper=model.upper[:n].tolist(),
-        disturbances=torque_disturbances(model, noise),
-        seed=f"{model.drives}.seed" if model.drives else "",
-    )
+    posterior = _posterior(model, z, covariance, noise)
     return Calibration(
         scenario=calibrated_scenario(scenario, results, posterior, logs=prepared.logs, reasons=reasons),
         parameters=results,
@@ -488,6 +475,21 @@ def _result(
         information=info,
         segments=int(used.sum()),
         sources=tuple(prepared.logs),
+    )
+
+
+def _posterior(model: JointModel, z: Array, covariance: Array, noise: Noise) -> Posterior:
+    """Return the joint distribution of the parameters, with what else makes predictions uncertain."""
+    n = model.scalars
+    return Posterior(
+        addresses=model.names[:n],
+        inertias=list(model.bodies),
+        mean=z.tolist(),
+        covariance=(0.5 * (covariance + covariance.T)).tolist(),
+        lower=model.lower[:n].tolist(),
+        upper=model.upper[:n].tolist(),
+        disturbances=torque_disturbances(model, noise),
+        seed=f"{model.drives}.seed" if model.drives else "",
     )
 
 

@@ -140,18 +140,7 @@ class JointDrives(AddressedSystem):
         self.entry_names = tuple(joint.name() for joint in joints)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
-        self._torque = self.declare_discrete_state(torque=Quantity(before, "N m"))
-        # One group for all internal state: every group costs more than the arithmetic.
-        memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
-        if self.max_delay:
-            memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
-        memory["disturbing_torque"] = Quantity(np.zeros(n), "N m")
-        self._memory = self.declare_discrete_state(**memory)
-        # The velocities one period before, and 1 if there are some.
-        self._last = self.declare_discrete_state(
-            last_velocity=Quantity(np.zeros(n), "rad/s"), has_last=Quantity(0.0, "1")
-        )
+        self._declare_state(np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,))))
         self.settings = self.declare_parameters(
             **{name: Quantity(value, _UNITS[name], (_lowest(name), inf)) for name, value in entries.items()},
             inertia=Quantity(least_inertia(plant, joints), "kg m^2", (0.0, inf)),
@@ -167,6 +156,21 @@ class JointDrives(AddressedSystem):
         is_discrete, states = self.step > 0.0, plant.num_multibody_states()
         self.kernel = _friction(self.velocities, states, self.step or self.period, is_discrete)
         self._declare_torque()
+
+    def _declare_state(self, before: NDArray[np.float64]) -> None:
+        """Declare the discrete state of drives whose torques were ``before``, (n,), in N m."""
+        n = self.n
+        self._torque = self.declare_discrete_state(torque=Quantity(before, "N m"))
+        # One group for all internal state: every group costs more than the arithmetic.
+        memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
+        if self.max_delay:
+            memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
+        memory["disturbing_torque"] = Quantity(np.zeros(n), "N m")
+        self._memory = self.declare_discrete_state(**memory)
+        # The velocities one period before, and 1 if there are some.
+        self._last = self.declare_discrete_state(
+            last_velocity=Quantity(np.zeros(n), "rad/s"), has_last=Quantity(0.0, "1")
+        )
 
     def _declare_torque(self) -> None:
         """Declare the output port and the updates: a discrete plant feels friction that is computed at its own step."""
