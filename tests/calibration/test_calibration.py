@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import casadi
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -157,6 +158,30 @@ def test_derivatives_of_the_innovations_are_those_of_differences() -> None:
     for k, step in enumerate((1e-5, 1e-6, 1e-5, 1e-5)):
         numeric = (white(z + step * np.eye(4)[k]) - white(z - step * np.eye(4)[k])) / (2.0 * step)
         np.testing.assert_allclose(slopes[..., k], numeric, rtol=1e-4, atol=1e-4 * abs(numeric).max())
+
+
+def test_steps_in_a_loop_are_those_of_one_long_expression() -> None:
+    """Positions every 20 ms of a plant that steps by 1 ms: one step is compiled, and its derivatives are chained."""
+    times = 0.02 * np.arange(120)
+    signals = np.sin(3.0 * times)[:, np.newaxis], np.cos(5.0 * times)[:, np.newaxis]
+    model = JointModel(PendulumScenario(time_step=0.001).build(), PARAMETERS)
+    segments = Segments(model, [JointRecording("run.csv", times, *signals)], duration=1.0)
+    z = np.array(list(VALUES.values()))
+    linearized = segments.linearized(z)
+    x, m, h, p = model.step.sx_in()
+    following = x
+    for _ in range(20):
+        following = model.step(following, m, h, p)
+    results = [following, *(casadi.jacobian(following, by) for by in (x, p))]
+    unrolled = casadi.Function("unrolled", [x, m, h, p], results)
+    # The motors' torques come later than the commands, by the delay of the drives.
+    motors = model.motor(times, signals[1], z)[0]
+    for k in range(segments.steps):
+        state = segments.trajectory[k, 0]
+        after, A, slopes = (np.asarray(part) for part in unrolled(state, motors[k], 0.001, z))
+        np.testing.assert_allclose(linearized.defects[k, 0], after.ravel() - segments.trajectory[k + 1, 0], atol=1e-13)
+        np.testing.assert_allclose(linearized.A[k, 0], A, rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(linearized.slopes[k, 0], slopes, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -205,6 +206,44 @@ def test_ctrl_c_ends_all_processes_of_a_compiler_and_leaves_nothing_behind(cache
     os.close(child)
     assert not list(temporary.iterdir())
     assert not list((cache / "cache").rglob("law*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_compiler_ends_with_its_parent(cache, monkeypatch, number):
+    """Two real processes: the parent dies by a signal in the middle of a compilation."""
+    compiler, lives, temporary, programs = (cache / name for name in ("slow_cc", "lives", "tmp", "bin"))
+    removed = cache / "removed"
+    for folder in (temporary, programs):
+        folder.mkdir()
+    for fifo in (lives, removed):
+        os.mkfifo(fifo)
+    (programs / "rm").write_text(f'#!/bin/sh\n{shutil.which("rm")} "$@"; echo "$@" > {removed}\n')
+    (programs / "rm").chmod(0o755)
+    # Its child, as `cc1` is one of `cc`, says who the parent is, and keeps the other end of the fifo open.
+    compiler.write_text(f"#!/bin/sh\nmktemp\n(echo $PPID; sleep 20; echo goes on) > {lives} &\nwait\n")
+    compiler.chmod(0o755)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "CC": str(compiler), "TMPDIR": str(temporary)}
+    environment["PATH"] = f"{programs}:{environment['PATH']}"
+    script = "import tests.components.casadi_system.test_compiler as t\nt.CasadiSystem(t.function(), compile=True)"
+    parent = subprocess.Popen([sys.executable, "-c", script], env=environment, stderr=subprocess.DEVNULL)
+    with lives.open() as fifo:
+        assert int(fifo.readline()) == parent.pid
+        assert list(temporary.iterdir())
+        parent.send_signal(number)
+        assert parent.wait() == -number
+        assert fifo.read() == ""  # All that kept it open have ended.
+    assert not list((cache / "cache").rglob("law*"))
+    assert removed.read_text().startswith("-rf ") and not list(temporary.iterdir())
+
+
+def test_long_compilations_are_told(cache, caplog, monkeypatch):
+    CasadiSystem(function(), compile=True)
+    assert not caplog.messages
+    monkeypatch.setattr(compiling, "_LARGE_SOURCE", 1000)
+    CasadiSystem(function(factor=3.0), compile=True)
+    before, after = caplog.messages
+    assert before.startswith("compiling law_y: 0.0 MB of C by ") and str(cache / "cache" / "vtbdrake") in before
+    assert after.startswith("law_y is compiled, after ")
 
 
 def _without_the_end(contents: bytes, size: int) -> bytes:

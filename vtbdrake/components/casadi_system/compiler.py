@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -27,6 +28,17 @@ _log = logging.getLogger(__name__)
 
 LONGEST_COMPILATION = 600.0
 """s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
+# Bytes of C code that take so long to compile that the user is told, and how long optimizing compilers take for one.
+_LARGE_SOURCE = 500_000
+_SECONDS_PER_BYTE = 15e-6
+# Runs the compiler "$@" beside a watcher, which reads a line when the compiler has ended. If standard input closes
+# without one, this process has ended, by whatever signal: then the watcher ends the compiler with its children (it
+# ignores the signal that it sends to the group), and removes its files.
+_WITH_PARENT = """\
+exec 3<&0 </dev/null
+(trap '' TERM; read -r _ <&3 || { kill -TERM 0; rm -rf "$TMPDIR"; kill -KILL 0; }) 2>/dev/null &
+exec "$@" 3<&-
+"""
 _ONE_AT_A_TIME = threading.Lock()
 _DIGEST_SIZE = hashlib.sha256().digest_size
 _KERNELS: dict[str, tuple[Path, str]] = {}  # Functions that are written in C -> their libraries and their sources.
@@ -230,38 +242,57 @@ def compile_library(source: str, library: Path, kernels: Sequence[Path] = ()) ->
         )
     # No other user may write there: the files in the folder are executed.
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder, whole_file(library) as partial:
-        c_file = Path(folder) / "function.c"
+    name, is_long, begin = library.stem.partition("-")[0], len(source) > _LARGE_SOURCE, time.monotonic()
+    if is_long:
+        _log.warning(
+            "compiling %s: %.1f MB of C by %s, which may take about %.0f s of processor time; the library is kept in "
+            "%s for the next time",
+            *(name, 1e-6 * len(source), command[0], _SECONDS_PER_BYTE * len(source), library.parent),
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        # Compiled here and not at its place: whoever is killed meanwhile leaves no half library there.
+        c_file, made = Path(folder) / "function.c", Path(folder) / "function.so"
         c_file.write_text(source, encoding="utf-8")
-        returncode, complaint = _run([*command, str(c_file), *map(str, kernels), "-o", str(partial), "-lm"], folder)
+        returncode, complaint = _run([*command, str(c_file), *map(str, kernels), "-o", str(made), "-lm"], folder)
         if returncode:
             raise CompilerError(f"{shlex.join(command)} failed ({returncode}): {complaint.strip()}")
-        contents = partial.read_bytes()
-        partial.write_bytes(contents + _digest(contents))
+        contents = made.read_bytes()
+        with whole_file(library) as partial:
+            partial.write_bytes(contents + _digest(contents))
+    if is_long:
+        _log.warning("%s is compiled, after %.0f s", name, time.monotonic() - begin)
 
 
 def _run(command: Sequence[str], folder: str) -> tuple[int, str]:
     """Run a compiler, with its own files in a folder; return its exit code and what it wrote to stderr.
 
-    Ctrl-C ends the processes that it has started, too: ``cc`` alone would leave the compilation and its files behind.
+    The processes that it has started end with it: at Ctrl-C, after `LONGEST_COMPILATION`, and at the end of this
+    process, by whatever signal. ``cc`` alone would leave the compilation and its files behind.
     """
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": folder},
-        process_group=0,
-    ) as process:
-        try:
-            complaint = process.communicate(timeout=LONGEST_COMPILATION)[1]
-        except BaseException as error:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            if isinstance(error, subprocess.TimeoutExpired):
-                raise CompilerError(
-                    f"{command[0]} did not end within {LONGEST_COMPILATION:g} s: compile a smaller part or a shorter "
-                    "rollout, or leave out compile=True"
-                ) from None
-            raise
+    watched, end = os.pipe()
+    try:
+        with subprocess.Popen(
+            ["/bin/sh", "-c", _WITH_PARENT, "sh", *command],
+            stdin=watched,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": folder},
+            process_group=0,
+        ) as process:
+            try:
+                complaint = process.communicate(timeout=LONGEST_COMPILATION)[1]
+                os.write(end, b"\n")
+            except BaseException as error:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                if isinstance(error, subprocess.TimeoutExpired):
+                    raise CompilerError(
+                        f"{command[0]} did not end within {LONGEST_COMPILATION:g} s: compile a smaller part or a "
+                        "shorter rollout, or leave out compile=True"
+                    ) from None
+                raise
+    finally:
+        os.close(watched)
+        os.close(end)
     return process.returncode, complaint
