@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 
@@ -10,8 +11,10 @@ import pytest
 
 from tests.calibration.pendulum import DRIVES, PERIOD, PendulumScenario, recorded
 from tests.calibration.test_calibration import COULOMB, PARAMETERS, TRUTH, calibrated
-from vtbdrake.calibration import CalibrationError, JointModel, JointRecording, calibrate, information
+from vtbdrake.calibration import Calibration, CalibrationError, JointModel, JointRecording, calibrate, information
 from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.inverse_dynamics import InverseDynamics
+from vtbdrake.calibration.log_checks import check_log, check_torques, currents
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording import DrivenScenario, Log, Series, read_table
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
@@ -19,6 +22,14 @@ from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 pytestmark = pytest.mark.one_python
 
 LINKS = "sim.sys.pendulum"
+# An angle at which the elbow is in the middle of its motion, so that it is wrapped there.
+ZERO = np.array([0.0, 2.9])
+SIGNALS = {"position": "joint_position", "torque": "torque"}
+DOUBLE = [
+    Parameter(f"{LINKS}.lower.mass", 0.3, 1.5),
+    Parameter(f"{LINKS}.upper.center_of_mass[2]", -0.3, -0.05),
+    Parameter("sim.act.drives.coulomb[0]", 0.0, 0.5),
+]
 
 
 @cache
@@ -48,15 +59,13 @@ def with_columns(log: Log, change: Callable[[np.ndarray, np.ndarray], tuple[np.n
     return Log(log.source, {name_q: Series(q.times, values[0])}, {name_u: Series(u.times, values[1])})
 
 
-def of_double_pendulum(log: Log) -> object:
-    parameters = [
-        Parameter(f"{LINKS}.lower.mass", 0.3, 1.5),
-        Parameter(f"{LINKS}.upper.center_of_mass[2]", -0.3, -0.05),
-        Parameter("sim.act.drives.coulomb[0]", 0.0, 0.5),
-    ]
-    return calibrate(
-        DoublePendulumScenario(), log, parameters, position="joint_position", torque="torque", segment=0.25
-    )
+def of_double_pendulum(log: Log) -> Calibration:
+    return calibrate(DoublePendulumScenario(), log, DOUBLE, **SIGNALS, segment=0.25)
+
+
+@cache
+def double_pendulum_model() -> JointModel:
+    return JointModel(DoublePendulumScenario().build(), DOUBLE)
 
 
 @pytest.mark.slow_cases
@@ -81,6 +90,87 @@ def test_columns_in_another_order_unit_or_sign_are_refused(
         return
     with pytest.raises(CalibrationError, match=message):
         of_double_pendulum(with_columns(log, change))
+
+
+def moved(values: np.ndarray, column: int, rows: int) -> np.ndarray:
+    """Return the values with one column recorded some rows late."""
+    late = values.copy()
+    late[:, column] = values[np.maximum(np.arange(len(values)) - rows, 0), column]
+    return late
+
+
+def wrapped(q: np.ndarray) -> np.ndarray:
+    return (q + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def checks_of(change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> tuple[str, ...]:
+    """Return what the checks of the double pendulum's log say, with a defect; all of it, as one tuple."""
+    log, model, signals = with_columns(double_pendulum_log(), change), double_pendulum_model(), SIGNALS
+    outcome = check_log(log, DoublePendulumScenario().interface(), **signals)
+    recording, dynamics = JointRecording.of(log, model, **signals), InverseDynamics(model)
+    fit = dynamics.fit([recording], start=model.start)
+    torques = check_torques(model, dynamics, [recording], fit)
+    likely = currents(model, dynamics, [recording])
+    return (*outcome.remarks, *outcome.doubts, *torques.remarks, *torques.doubts, *likely)
+
+
+def test_clean_log_has_no_defect() -> None:
+    assert checks_of(lambda q, u: (q, u)) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda q, u: (moved(q, 1, 8), u), "position 1 seems to be recorded 32 ms too late"),
+        (lambda q, u: (moved(q, 0, 2), u), "position 0 seems to be recorded 8 ms too late"),
+        (lambda q, u: (q, moved(u, 0, 10)), "torque 0 seems to be recorded [34]. ms too late"),
+    ],
+)
+def test_one_column_that_comes_late_is_named(
+    change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], message: str
+) -> None:
+    (doubt,) = checks_of(change)
+    assert re.match(message, doubt), doubt
+
+
+def test_currents_in_place_of_torques_are_named_with_their_factors() -> None:
+    constants = np.array([0.4, 0.15])
+    (*_, likely) = checks_of(lambda q, u: (q, u / constants))
+    match = re.match(r"the torques seem to be currents, or of another unit: ([\d.]+), ([\d.]+) times as large", likely)
+    assert match, likely
+    # Both may be too small by one factor, as the mass of the lower link is free.
+    factors = np.array([float(match[1]), float(match[2])])
+    assert factors[0] / factors[1] == pytest.approx(constants[0] / constants[1], rel=0.05)
+    assert factors == pytest.approx(constants, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda q, u: (q * [np.rad2deg(1.0), 1.0], u), "with position 0 in degrees, alone"),
+        (lambda q, u: (q * [1.0, np.rad2deg(1.0)], u), "with position 1 in degrees, alone"),
+        (lambda q, u: (wrapped(q + ZERO) - ZERO, u), r"\[1\] jumps by 2 pi rad 10 times, first at 0.22 s"),
+        (lambda q, u: (np.rad2deg(wrapped(q + ZERO)), u), r"\[1\] jumps by 360, which are degrees 10 times"),
+    ],
+)
+def test_degrees_of_one_joint_and_angles_that_are_wrapped_are_refused(
+    change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], message: str
+) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        checks_of(change)
+
+
+@pytest.mark.slow
+def test_currents_are_the_likely_cause_of_a_bad_calibration() -> None:
+    result = of_double_pendulum(with_columns(double_pendulum_log(), lambda q, u: (q, u / [0.4, 0.15])))
+    assert not result.accepted and any("seem to be currents" in reason for reason in result.reasons), result
+
+
+def test_signal_that_the_scenario_does_not_have_is_refused_with_near_names() -> None:
+    log = pendulum_log()
+    renamed = Log(log.source, {"positon": log.sense["position"]}, log.act)
+    with pytest.raises(CalibrationError, match="has no sensor signal positon; did you mean position?"):
+        calibrate(PendulumScenario(), renamed, PARAMETERS, position="positon", torque="torque")
 
 
 def test_positions_and_torques_that_are_exchanged_are_refused() -> None:
@@ -181,7 +271,7 @@ def test_sensor_that_freezes_is_not_accepted() -> None:
 
 def test_recording_without_any_motion_is_refused() -> None:
     still = with_columns(pendulum_log(), lambda q, u: (0.0 * q, u))
-    with pytest.raises(CalibrationError, match="no entry of position ever changes"):
+    with pytest.raises(CalibrationError, match=r"no entry of position ever changes.* Either the robot stood still"):
         calibrated(still)
 
 

@@ -46,6 +46,12 @@ def write(path: Path) -> Path:
     return path
 
 
+def test_one_column_may_have_a_unit_of_another() -> None:
+    table = {"time": [0.0, 0.1], "q1": [1.0, 2.0], "q2": [90.0, 180.0]}
+    log = read_table(table, sense={"position": ["q1", "q2"]}, units={"q2": "deg"})
+    np.testing.assert_allclose(log.sense["position"].values, [[1.0, np.pi / 2.0], [2.0, np.pi]], rtol=1e-15)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".txt", ".dat", ".npz", ".parquet"])
 def test_columns_become_signals_in_si_units(tmp_path: Path, suffix: str) -> None:
     log = read_table(

@@ -55,6 +55,10 @@ def path(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
         (b"t,q\n# s, rad\n# of the arm\n0,1\n0.1,2\n", {"t": [0.0, 0.1], "q": [1.0, 2.0]}),
         (b"0 1\n# s rad\n0.1 2\n", {"0": [0.0, 0.1], "1": [1.0, 2.0]}),
         (b"# of the whole arm\n0,1\n0.1,2\n", {"0": [0.0, 0.1], "1": [1.0, 2.0]}),
+        (b"% of the arm\n// at noon\n\nt,q\n0,1\n% paused\n0.1,2\n", {"t": [0.0, 0.1], "q": [1.0, 2.0]}),
+        (b"sep=;\nt;q\n0;1,5\n", {"t": [0.0], "q": [1.5]}),
+        (b"t;q\n0;1\n0,1;1,5\n", {"t": [0.0, 0.1], "q": [1.0, 1.5]}),
+        (b'"t","q"\n"0","1,5"\n"0,1","2,5"\n', {"t": [0.0, 0.1], "q": [1.5, 2.5]}),
         (b"t,day,on\n0,2026-11-29,true\n", {"t": [0.0], "day": ["2026-11-29"], "on": ["true"]}),
     ],
 )
@@ -78,6 +82,10 @@ def test_columns_of_a_text(path: Path, text: bytes, columns: dict[str, list[floa
         (b"t,q\n0,1\n1\n2,3\n", "row 1 has 1 columns, not 2"),
         (b"t,q\n0\n1,2\n", "row 0 has 1 columns, not 2"),
         (b"t  q\n0  1\n1\n2  3\n", "row 1 has 1 columns, not 2"),
+        (b"t,q\n0,004,0,1\n0,008,0,2\n", "row 0 has 4 columns, but there are 2 names: decimal commas"),
+        (b"t,q\n0,1,2\n0.1,2,3\n", "row 0 has 3 columns, but there are 2 names: decimal commas"),
+        (b"run 7, noon\nt,q,u\n0,1,2.5\n", "row 0 has 3 columns, but there are 2 names: is there a line above"),
+        (b"Run of the arm\nt,q\n0,1\n", r"row 0 has 1 columns, not 4 .*Begin it with #"),
     ],
 )
 def test_bad_text_is_refused(path: Path, text: bytes, message: str) -> None:

@@ -16,7 +16,7 @@ from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
 from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
-from vtbdrake.calibration.log_checks import check_log, check_torques
+from vtbdrake.calibration.log_checks import check_log, check_torques, currents
 from vtbdrake.calibration.missing_terms import lost_friction, missing_terms
 from vtbdrake.calibration.posterior import sandwich_covariance, torque_disturbances
 from vtbdrake.common.argument_checks import counted
@@ -282,6 +282,8 @@ class _Prepared:
         doubts: What speaks against a fit to them.
         segments: The recordings in segments.
         some: Some of the segments, by which the noise is found.
+        recordings: The recordings, without their gaps.
+        dynamics: Inverse dynamics of the model.
         start: The parameters by inverse dynamics.
         noise: The noise that is given; None: it is found.
         guess: Where the search of the noise begins.
@@ -294,9 +296,15 @@ class _Prepared:
     doubts: tuple[str, ...]
     segments: Segments
     some: Segments
+    recordings: tuple[JointRecording, ...]
+    dynamics: InverseDynamics
     start: Array
     noise: Noise | None
     guess: Noise
+
+    def causes(self) -> list[str]:
+        """Return the likely cause of a bad fit, as a sentence, if there is one."""
+        return currents(self.model, self.dynamics, self.recordings)
 
     @classmethod
     def of(
@@ -343,6 +351,8 @@ class _Prepared:
             doubts=tuple(doubt for check in checks for doubt in check.doubts),
             segments=Segments(model, recordings, duration=settings.segment),
             some=Segments(model, recordings, duration=settings.segment, most=_NOISE_SEGMENTS),
+            recordings=tuple(recordings),
+            dynamics=dynamics,
             start=fit.z,
             noise=settings.noise,
             guess=Noise.guess(recordings, fit.unexplained),
@@ -359,7 +369,7 @@ class _Prepared:
                 z, noise = _gauss_newton(self.some, z, self.guess, fits_noise=True)
             return _gauss_newton(self.segments, z, noise, used)
         except CalibrationError as error:
-            raise CalibrationError(". ".join([str(error), *self.doubts])) from error
+            raise CalibrationError(". ".join([str(error), *self.doubts, *self.causes()])) from error
 
     def information(self, noise: Noise, z: Array) -> Information:
         """Return the information in the recordings with this noise, at these parameters."""
@@ -434,8 +444,7 @@ def _result(
     fit, holdout = (_rms(white[:, part]) for part in (used, held_back))
     J = innovations.slopes[:, used].reshape(-1, len(z))
     info = information_of(J, model.names, model.scales)
-    if nothing := [name for name in info.nothing if name in model.names[: model.scalars]]:
-        raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
+    _check_told(model, info)
     sandwich = sandwich_covariance(innovations, used, segments.period, info)
     gradient = (J * model.scales).T @ white[:, used].ravel()
     bounds = _Bounds(model, z, gradient, info, np.diag(sandwich))
@@ -448,6 +457,7 @@ def _result(
     deviations = np.sqrt(np.diag(sandwich)) * model.scales
     reasons += lost_friction(segments, prepared.start, z, noise, deviations)
     reasons += map(str, missing_terms(segments, linearized, noise, z, used, info))
+    reasons += prepared.causes() if reasons else []
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
         verdict = Verdict.NO_EVIDENCE
@@ -491,6 +501,12 @@ def _posterior(model: JointModel, z: Array, covariance: Array, noise: Noise) -> 
         disturbances=torque_disturbances(model, noise),
         seed=f"{model.drives}.seed" if model.drives else "",
     )
+
+
+def _check_told(model: JointModel, info: Information) -> None:
+    """Raise an error if a parameter, other than a number of an inertia, changes nothing in the recordings."""
+    if nothing := [name for name in info.nothing if name in model.names[: model.scalars]]:
+        raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
 
 
 def calibrated_scenario(

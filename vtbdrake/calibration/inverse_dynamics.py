@@ -103,6 +103,26 @@ class InverseDynamics:
         shares = (e**2).mean(axis=0) / np.maximum(power, 1e-12)
         return TorqueFit(z, e, float(shares.mean()))
 
+    def torque_factors(self, recordings: Sequence[JointRecording], z: Array) -> Array:
+        """Return by which factor the torques of each actuator would explain the motion best, (nu,).
+
+        Args:
+            recordings: The recordings.
+            z: The parameters, (nz,).
+        """
+        model = self._model
+        needed_torques, motor_torques = [], []
+        for recording in recordings:
+            smoothed = (part[_ENDS:-_ENDS:_STRIDE].T for part in recording.smoothed())
+            q, v, a = smoothed
+            m = model.motor(recording.times, recording.u, z)[0][_ENDS:-_ENDS:_STRIDE]
+            n = len(m)
+            left = model.unexplained.map(n)(q, v, a, m.T, np.tile(z[:, np.newaxis], (1, n)))
+            motor_torques.append(m)
+            needed_torques.append(np.asarray(left).T @ model.selection + m)
+        tau, needed = np.concatenate(motor_torques), np.concatenate(needed_torques)
+        return np.asarray((tau * needed).sum(axis=0) / np.maximum((tau**2).sum(axis=0), 1e-300))
+
 
 def directions_of(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:
     """Return eigenvalues and directions of the information about scaled parameters, and which are determined."""

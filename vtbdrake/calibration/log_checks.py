@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from math import pi
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
 from vtbdrake.calibration.joint_model import CalibrationError, JointModel
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
+from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.recording.log import GAP, Log, Series
 from vtbdrake.testbed import Interface
 
@@ -42,6 +44,14 @@ _GOOD = 0.02
 # Torques that come by another delay are mentioned if they leave this share.
 _ALIGNED = 0.7
 _DELAYS = (1, 2, 4, 8, 16, 32)  # in periods
+# Torques whose factors are all within this ratio of 1 are no currents.
+_GAIN = 1.25
+# Single columns are looked at if this share of the power is not explained.
+_NOISY = 2e-3
+# Times that factors of the torques and parameters are fitted in turn.
+_ROUNDS = 3
+# Steps of an angle between two samples are this near to a whole turn, in rad, where it was wrapped.
+_NEAR_A_TURN = 0.5
 _SAMPLES = 500  # of a fit of the torques for one reading
 _MOST_SWAPPED = 8  # joints
 
@@ -68,14 +78,25 @@ def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> 
         torque: The actuator signal of the joint torques.
 
     Raises:
-        CalibrationError: No joint moves, or nothing is a number.
+        CalibrationError: No joint moves, nothing is a number, an angle jumps by a turn, or the scenario has no such
+            signal.
     """
+    for kind, name, signals in (("sensor", position, interface.sense), ("actuator", torque, interface.act)):
+        if name not in (names := [signal.name for signal in signals]):
+            near = did_you_mean(name, names) or f", but {', '.join(names)}"
+            raise CalibrationError(f"the scenario has no {kind} signal {name}{near}")
     q, u = log.sense[position], log.act[torque]
     if not np.isfinite(q.values).all() or not np.isfinite(u.values).all():
         raise CalibrationError(f"{log.source} has positions or torques that are not finite: leave these samples out")
     dead = np.flatnonzero(np.ptp(q.values, axis=0) == 0.0)
     if dead.size == q.values.shape[1]:
-        raise CalibrationError(f"{log.source}: no entry of {position} ever changes, so that nothing can be told")
+        raise CalibrationError(
+            f"{log.source}: no entry of {position} ever changes, so that nothing can be told: it is "
+            f"{np.array2string(q.values[0], separator=', ', precision=6)} in {len(q)} samples. Either the robot stood "
+            "still (command a motion), or the columns are not what its sensors measured (in a simulation, "
+            f"sim.sense.{position}.... moves, real.sense.{position} does not)"
+        )
+    _check_turns(log.source, position, q)
     remarks = list(log.remarks)
     for name, series in ((position, q), (torque, u)):
         remarks += _of_clock(f"{log.source}: {name}", series)
@@ -103,6 +124,25 @@ def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> 
                 "it is a limit of the recording, another torque has acted"
             )
     return Checks(tuple(dict.fromkeys(remarks)), tuple(_beyond_bounds(log, interface, torque)))
+
+
+def _check_turns(source: str, position: str, q: Series) -> None:
+    """Check that no position jumps by a turn from one sample to the next.
+
+    Raises:
+        CalibrationError: One does: the angle was wrapped.
+    """
+    steps, within = np.diff(q.values, axis=0), np.diff(q.times) <= GAP * q.uniformity.period
+    for turn, unit in ((2.0 * pi, "2 pi rad"), (360.0, "360, which are degrees")):
+        near = (abs(abs(steps) - turn) < _NEAR_A_TURN * turn / (2.0 * pi)) & within[:, np.newaxis]
+        # Other steps are much smaller, or the samples are too far apart to tell.
+        near &= np.median(abs(steps), axis=0) < 0.1 * turn
+        for k in np.flatnonzero(near.any(axis=0)):
+            rows = np.flatnonzero(near[:, k])
+            raise CalibrationError(
+                f"{source}: {position}[{k}] jumps by {unit} {counted(rows.size, 'time')}, first at "
+                f"{q.times[rows[0]]:.6g} s: the angle was wrapped; unwrap the column (numpy.unwrap)"
+            )
 
 
 def _of_clock(label: str, series: Series) -> Iterator[str]:
@@ -187,9 +227,11 @@ def check_torques(
         if least < _BETTER * share and least < _EXPLAINED:
             raise CalibrationError(
                 f"{recordings[0].source}: as given, {share:.0%} of the power of the torques is not explained; with "
-                f"{text}, {least:.1%}: check signals, columns and units (read_table has units=)"
+                f"{text}, {least:.1%}: check signals, columns and units (units= of read_table, --unit)"
             )
-    if not model.varies_delay:
+    late = _late_column(model, share_of, share, recordings)
+    doubts += late
+    if not model.varies_delay and not late:
         delays = {d: share_of(_delayed(d)) for d in (*_DELAYS, *(-each for each in _DELAYS)) if _fits(recordings, d)}
         d, least = min(delays.items(), key=lambda item: item[1], default=(0, share))
         if least < _ALIGNED * share:
@@ -207,8 +249,102 @@ def check_torques(
     return Checks(tuple(remarks), tuple(doubts))
 
 
+def currents(model: JointModel, dynamics: InverseDynamics, recordings: Sequence[JointRecording]) -> list[str]:
+    """Return a sentence if each torque has a factor with which the recordings are explained much better.
+
+    Args:
+        model: The model.
+        dynamics: Its inverse dynamics.
+        recordings: The recordings.
+    """
+    share, z = dynamics.fit(recordings, start=model.start, most=_SAMPLES).share, model.start
+    for _ in range(_ROUNDS):  # Friction is told with the factors, and the factors without friction.
+        factors = dynamics.torque_factors(recordings, z)
+        scaled = [replace(each, u=factors * each.u) for each in recordings]
+        z, _, least = dynamics.fit(scaled, start=model.start, most=_SAMPLES)
+    if max(abs(np.log(np.maximum(abs(factors), 1e-9)))) < np.log(_GAIN) or least > min(_BETTER * share, _EXPLAINED):
+        return []
+    listed = ", ".join(f"{factor:.3g}" for factor in factors)
+    return [
+        f"the torques seem to be currents, or of another unit: {listed} times as large, {least:.2g} of their power is "
+        f"not explained, instead of {share:.2g}; multiply them by the constants of the motors (and gears), unless the "
+        "masses of the model are wrong by these factors"
+    ]
+
+
 def _fits(recordings: Sequence[JointRecording], delay: int) -> bool:
     return all(len(each.times) > 4 * abs(delay) + 100 for each in recordings)
+
+
+def _late_column(
+    model: JointModel,
+    share_of: Callable[[Callable[[JointRecording], JointRecording]], float],
+    share: float,
+    recordings: Sequence[JointRecording],
+) -> list[str]:
+    """Return a sentence if one column that is moved in time explains the torques much better, and all torques do not.
+
+    Args:
+        model: The model.
+        share_of: Returns the share of unexplained power of a reading.
+        share: The share of the columns as they are.
+        recordings: The recordings.
+    """
+    delays = [d for d in _DELAYS if _fits(recordings, d)]
+    if share < _NOISY or model.nq < 2 or not delays:
+        return []
+    together, _ = _best_shift(share_of, share, delays, _delayed)
+    shifts = [
+        (*_best_shift(share_of, share, delays, partial(_with_late_column, side, k)), side, k)
+        for side, size in (("q", model.nq), ("u", model.nu))
+        for k in range(size)
+    ]
+    least, periods, side, k = min(shifts)
+    if least > _ALIGNED * share or least > _ALIGNED * together:
+        return []
+    name, shift = "position" if side == "q" else "torque", 1e3 * periods * recordings[0].period
+    return [
+        f"{name} {k} seems to be recorded {abs(shift):.3g} ms too {'late' if shift > 0 else 'early'} beside the "
+        f"other columns ({least:.2g} of the torques' power is not explained without that, instead of "
+        f"{share:.2g}): synchronize the columns"
+    ]
+
+
+def _best_shift(
+    share_of: Callable[[Callable[[JointRecording], JointRecording]], float],
+    share: float,
+    delays: Sequence[int],
+    reading: Callable[[int], Callable[[JointRecording], JointRecording]],
+) -> tuple[float, int]:
+    """Return the least share of unexplained power over shifts in time, and its number of periods, by doubling."""
+    best = share, 0
+    for sign in (1, -1):
+        for d in delays:
+            trial = share_of(reading(sign * d)), sign * d
+            if trial[0] >= best[0]:
+                break
+            best = trial
+        if best[1]:
+            break
+    # Between the last ones.
+    step = abs(best[1]) // 4
+    while step and best[1]:
+        best = min([best, *((share_of(reading(best[1] + move)), best[1] + move) for move in (-step, step))])
+        step //= 2
+    return best
+
+
+def _with_late_column(side: str, k: int, periods: int) -> Callable[[JointRecording], JointRecording]:
+    """Return the reading in which one column of positions ("q") or torques ("u") was recorded some periods late."""
+
+    def reading(recording: JointRecording) -> JointRecording:
+        rows = len(recording.times) - abs(periods)
+        synchronous, late = (slice(max(d, 0), max(d, 0) + rows) for d in (-periods, periods))
+        columns = {"q": recording.q[synchronous].copy(), "u": recording.u[synchronous].copy()}
+        columns[side][:, k] = getattr(recording, side)[late, k]
+        return replace(recording, times=recording.times[synchronous], **columns)
+
+    return reading
 
 
 def _delayed(periods: int) -> Callable[[JointRecording], JointRecording]:
@@ -235,6 +371,8 @@ def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording
 
     for factor, text in ((pi / 180.0, "degrees"), (2.0 * pi, "turns"), (180.0 / pi, "rad that were converted twice")):
         yield f"positions that are {text}", of(by_q=factor)
+    for k in range(model.nq if model.nq > 1 else 0):
+        yield f"position {k} in degrees, alone", of(by_q=1.0 - (1.0 - pi / 180.0) * np.eye(model.nq)[k])
     for k in range(model.nq):
         yield f"the other sign of position {k}", of(by_q=1.0 - 2.0 * np.eye(model.nq)[k])
     for k in range(model.nu):

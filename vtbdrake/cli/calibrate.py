@@ -90,7 +90,7 @@ def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[
 @option("--time COLUMN", "Column of the times in a table.", default="time")
 @option(
     "--unit NAME=UNIT",
-    "Unit of a signal or of the times in a table, if it is none of SI. May be repeated.",
+    "Unit of a signal, of one column or of the times in a table, if it is none of SI. May be repeated.",
     name="units",
     parse=partial(assignment, form="NAME=UNIT"),
     multiple=True,

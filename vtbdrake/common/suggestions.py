@@ -19,5 +19,9 @@ def did_you_mean(name: str, names: Iterable[str], *, count: int = 3, cutoff: flo
     """
     import difflib  # Here: few names are mistyped, and `import vtbdrake` should stay quick.
 
-    near = difflib.get_close_matches(name, list(dict.fromkeys(names)), n=count, cutoff=cutoff)
+    by_folded: dict[str, list[str]] = {}  # `Time` is near `time`.
+    for each in dict.fromkeys(names):
+        by_folded.setdefault(each.casefold(), []).append(each)
+    matches = difflib.get_close_matches(name.casefold(), list(by_folded), n=count, cutoff=cutoff)
+    near = [each for match in matches for each in by_folded[match]][:count]
     return f"; did you mean {' or '.join(near)}?" if near else ""

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
+from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.recording.lerobot_format import INFO
 from vtbdrake.recording.lerobot_reader import LeRobotTable
 from vtbdrake.recording.log import Log, Series, checked_series
@@ -69,7 +69,7 @@ def read_table(
         time: The column of the times, in a recording of messages a field of each topic, such as ``log_time`` or
             ``header.stamp``; or the period in s, if the table has no times.
         times: The column of the times of the signals that have others, by signal.
-        units: Units that are none of SI (`UNITS`): of a signal by its name, of times by their column.
+        units: Units that are none of SI (`UNITS`): of a signal by its name, of one column or of times by the column.
         episode: Read the rows of this episode alone, in a table that has several.
         episodes: The column with the number of each row's episode.
 
@@ -85,7 +85,9 @@ def read_table(
     if both := sense.keys() & act.keys():
         raise LogError(f"{', '.join(sorted(both))} cannot be both, a sensor signal and an actuator signal")
     _check_keys(times, {*sense, *act}, "times")
-    _check_keys(units, {*sense, *act, *times.values(), str(time)}, "a unit")
+    columns = {signal: [each] if isinstance(each, str) else list(each) for signal, each in {**sense, **act}.items()}
+    entries_of_all = {column for each in columns.values() for column in each}
+    _check_keys(units, {*columns, *entries_of_all, *times.values(), str(time)}, "a unit")
     remarks: list[str] = []
     rows = None if episode is None else _rows_of(_column(table, episodes, name)[:, 0], episode, f"{name}: {episodes}")
 
@@ -97,10 +99,10 @@ def read_table(
 
     def read(signals: Mapping[str, str | Sequence[str]]) -> dict[str, Series]:
         series = {}
-        for signal, column in signals.items():
-            each = [column] if isinstance(column, str) else column
-            label = f"{name}: {signal}"
-            entries = _side_by_side([_column(table, entry, name) for entry in each], _factor(units.get(signal)), label)
+        for signal in signals:
+            each, label = columns[signal], f"{name}: {signal}"
+            factors = [_factor(units.get(entry, units.get(signal))) for entry in each]
+            entries = _side_by_side([_column(table, entry, name) for entry in each], factors, label)
             stamps = times.get(signal, time)
             if isinstance(stamps, str):
                 at = times_in(_time_column(table, stamps, each[0]), units.get(stamps))
@@ -117,14 +119,14 @@ def read_table(
     return Log(name, read_sense, read_act, remarks)
 
 
-def _side_by_side(columns: Sequence[Array], factor: float, label: str) -> Array:
-    """Return columns, (n, k) each, as one array times a factor, which is copied no more: read-only."""
+def _side_by_side(columns: Sequence[Array], factors: Sequence[float], label: str) -> Array:
+    """Return columns, (n, k) each, times their factors as one array, which is copied no more: read-only."""
     lengths = sorted({len(column) for column in columns})
     if len(lengths) > 1:
         raise LogError(f"{label}: its columns have {' and '.join(map(str, lengths))} rows, not one number of them")
     entries = np.empty((*lengths, sum(column.shape[1] for column in columns)))
     begin = 0
-    for column in columns:
+    for column, factor in zip(columns, factors, strict=True):
         end = begin + column.shape[1]
         np.multiply(column, factor, out=entries[:, begin:end])
         begin = end
@@ -143,7 +145,7 @@ def _rows_of(numbers: Array, episode: int, label: str) -> NDArray[Any]:
 def _check_keys(mapping: Mapping[str, Any], names: set[str], noun: str) -> None:
     for key in mapping:
         if key not in names:
-            raise LogError(f"{noun} for {key!r}, which is no signal{suggestion(key, names)}")
+            raise LogError(f"{noun} for {key!r}, which is no signal or column{did_you_mean(key, names)}")
 
 
 def _factor(unit: str | None) -> float:
@@ -167,14 +169,29 @@ def _column(table: Table, name: str, source: str) -> Array:
     else:
         shown = ", ".join(list(table)[:20]) + (", ..." if len(table) > 20 else "")
         remarks = "; ".join(["", *getattr(table, "remarks", ())])
-        raise LogError(f"{source} has no column {name!r}{suggestion(name, table)}; it has: {shown or 'none'}{remarks}")
+        raise LogError(
+            f"{source} has no column {name!r}{did_you_mean(name, table)}; it has: {shown or 'none'}{remarks}"
+        )
     try:
         values: Array = np.asarray(column, dtype=float)
     except (TypeError, ValueError) as error:
-        raise LogError(f"{source}: the column {name} is not of numbers: {error}") from None
+        raise LogError(f"{source}: the column {name} is not of numbers: {_first_text(column) or error}") from None
     if values.ndim not in (1, 2):
         raise LogError(f"{source}: the column {name} has the shape {values.shape}, not (n,) or (n, k)")
     return values.reshape(len(values), -1)
+
+
+def _first_text(column: Any) -> str:
+    """Return row and text of the first entry of a column that is no number; empty if the column has no texts."""
+    for row, text in enumerate(np.ravel(column)):
+        if not isinstance(text, str):
+            return ""
+        try:
+            float(text)
+        except ValueError:
+            units = "; begin a line of units or comments with #" if row == 0 else ""
+            return f"row {row} is {str(text)!r}{units}"
+    return ""
 
 
 def _time_column(table: Table, name: str, column: str) -> str:

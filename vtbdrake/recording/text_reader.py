@@ -12,6 +12,7 @@ import mmap
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,8 +23,11 @@ from numpy.typing import NDArray
 
 from vtbdrake.recording.log_format import LogError
 
-_COMMENT = "#"
-"""The first character of a line that is no row."""
+_COMMENTS = ("#", "%", "//")
+"""The beginnings of a line that is no row."""
+
+_ABOVE = re.compile(r"\s*$|sep=.\s*$", re.IGNORECASE)
+"""Further lines above the names: blank ones, and the separator as Excel writes it."""
 
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 """A number with a decimal comma, between separators that are no commas."""
@@ -36,14 +40,14 @@ def read_text(path: Path) -> Mapping[str, NDArray[Any]]:
     """Return the columns of a text by name: floats, NaN where a field is empty; texts, if some are no numbers.
 
     Without a line of names, the columns are "0", "1", ..., or have the names in a comment above the rows. Lines that
-    begin with # are comments. Where semicolons, tabs or blanks separate fields, numbers may have decimal commas. A last
-    row that was cut off is left out.
+    begin with #, % or // are comments. Where semicolons, tabs or blanks separate fields, numbers may have decimal
+    commas. A last row that was cut off is left out.
 
     Args:
         path: The file, in UTF-8.
 
     Raises:
-        LogError: It has fewer than two lines, two columns with one name, or a row with too few fields.
+        LogError: It has fewer than two lines, two columns with one name, or a row with too few or too many fields.
     """
     layout = _Layout.of(path)
     columns = _read_by_arrow(path, layout) if find_spec("pyarrow") else None
@@ -81,17 +85,17 @@ class _Layout:
         decimal = "," if any(map(_DECIMAL_COMMA.fullmatch, _fields(first or head, separator))) else "."
         if not all(_is_number(field, decimal) for field in fields):
             return cls(_checked_names(fields, path), separator, decimal, len(above) + 1 + len(below))
-        comment = above[-1] if above else ""
-        names = _fields(comment.lstrip(f"{_COMMENT} ").strip(), separator)  # As numpy.savetxt writes its header.
+        comment = next((line for line in reversed(above) if line.startswith(_COMMENTS)), "")
+        names = _fields(comment.lstrip("#%/ ").strip(), separator)  # As numpy.savetxt writes its header.
         if len(names) != len(fields):
             names = [str(k) for k in range(len(fields))]
         return cls(_checked_names([name.strip() for name in names], path), separator, decimal, len(above))
 
 
 def _after_comments(file: TextIO) -> tuple[list[str], str]:
-    """Return the comments that follow in a file, and the line after them."""
+    """Return the comments and blank lines that follow in a file, and the line after them."""
     comments = []
-    while (line := file.readline()).startswith(_COMMENT):
+    while (line := file.readline()) and (line.startswith(_COMMENTS) or _ABOVE.match(line)):
         comments.append(line)
     return comments, line
 
@@ -115,14 +119,32 @@ def _is_number(text: str, decimal: str) -> bool:
     return True
 
 
-def _numbers(column: Sequence[str], decimal: str) -> NDArray[Any]:
+def _numbers(column: Sequence[str], layout: _Layout) -> NDArray[Any]:
     """Return a column as floats, NaN where it is empty; as texts, if it has others than numbers."""
     texts = np.array(column)
     texts[np.char.strip(texts) == ""] = "nan"
-    try:
-        return (texts if decimal == "." else np.char.replace(texts, decimal, ".")).astype(float)
-    except ValueError:
-        return texts
+    # The first row does not show the decimal mark if its numbers are whole.
+    for decimal in dict.fromkeys((layout.decimal, "." if layout.separator == "," else ",")):
+        with suppress(ValueError):
+            return (texts if decimal == "." else np.char.replace(texts, decimal, ".")).astype(float)
+    return texts
+
+
+def _check_width(fields: Sequence[str], row: int, path: Path, layout: _Layout) -> None:
+    """Check that a row has no more fields than there are names, but for empty ones after a last separator.
+
+    Raises:
+        LogError: It has more.
+    """
+    if not any(field.strip() for field in fields[len(layout.names) :]):
+        return
+    cause = ": is there a line above the names that is no comment (#), or a column without a name?"
+    if layout.separator == "," and all(re.fullmatch(r"\s*[+-]?\d*\s*", field) for field in fields):
+        cause = (
+            ": decimal commas cannot be told from commas between columns; write decimal points, or separate the "
+            "columns by semicolons"
+        )
+    raise LogError(f"{path}: row {row} has {len(fields)} columns, but there are {len(layout.names)} names{cause}")
 
 
 # -- by Arrow
@@ -131,15 +153,15 @@ def _numbers(column: Sequence[str], decimal: str) -> NDArray[Any]:
 class _ArrowColumns(Mapping[str, NDArray[Any]]):
     """The columns of a table of Arrow: floats, or the bytes of texts."""
 
-    def __init__(self, table: Any, decimal: str) -> None:
+    def __init__(self, table: Any, layout: _Layout) -> None:
         self._table = table
-        self._decimal = decimal
+        self._layout = layout
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column = self._table[name]
         if str(column.type) == "double":
             return np.asarray(column.to_numpy())
-        return _numbers([(text or b"").decode(errors="replace") for text in column.to_pylist()], self._decimal)
+        return _numbers([(text or b"").decode(errors="replace") for text in column.to_pylist()], self._layout)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._table.column_names)
@@ -154,12 +176,14 @@ def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
     from pyarrow import csv as arrow_csv
 
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if content.rfind(b"\n" + _COMMENT.encode()) >= max(_start(content, layout) - 1, 0):
+        end_of_line = max(_start(content, layout) - 1, 0)
+        if any(content.rfind(b"\n" + mark.encode()) >= end_of_line for mark in _COMMENTS):
             return None
     rows = _rows(pyarrow.memory_map(os.fspath(path)).read_buffer(), layout)
     first = _first_row(rows, layout)
     if len(first) < len(layout.names):
         return None
+    _check_width(first, 0, path, layout)
     # A separator may end each row: a field without a name.
     names = layout.names + [f"\0{k}" for k in range(len(first) - len(layout.names))]
     types = {name: pyarrow.float64() for name in names}
@@ -180,7 +204,7 @@ def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
                     column_types=types, include_columns=layout.names, null_values=[""], decimal_point=layout.decimal
                 ),
             )
-            return _ArrowColumns(table, layout.decimal)
+            return _ArrowColumns(table, layout)
         except pyarrow.ArrowInvalid as error:
             # A column whose first field is a number, or empty, has a text further down.
             column = re.search(r"In CSV column #(\d+)", str(error))
@@ -222,16 +246,19 @@ def _read_by_rows(path: Path, layout: _Layout) -> dict[str, NDArray[Any]]:
         for _ in range(layout.skipped):
             file.readline()
         if layout.separator is None:
-            rows = [line.split() for line in file if line.strip() and not line.startswith(_COMMENT)]
+            rows = [line.split() for line in file if line.strip() and not line.startswith(_COMMENTS)]
         else:
             reader = csv.reader(file, delimiter=layout.separator)
-            rows = [row for row in reader if row and not row[0].startswith(_COMMENT)]
+            rows = [row for row in reader if row and not row[0].startswith(_COMMENTS)]
     if not rows:
         raise LogError(f"{path} is no table: it has fewer than two lines")
     short = [number for number, row in enumerate(rows) if len(row) < len(names)]
     if short == [len(rows) - 1]:
         rows.pop()  # The recording was cut off in the middle of a row.
     elif short:
-        raise LogError(f"{path}: row {short[0]} has {len(rows[short[0]])} columns, not {len(names)}")
+        cause = "" if short[0] else f" ({', '.join(names)}): is the line above a comment? Begin it with #"
+        raise LogError(f"{path}: row {short[0]} has {len(rows[short[0]])} columns, not {len(names)}{cause}")
+    for number, row in enumerate(rows):
+        _check_width(row, number, path, layout)
     columns = list(zip(*rows, strict=False))  # A separator may end each row.
-    return {name: _numbers(column, layout.decimal) for name, column in zip(names, columns, strict=False)}
+    return {name: _numbers(column, layout) for name, column in zip(names, columns, strict=False)}

@@ -239,7 +239,7 @@ def test_compiler_ends_with_its_parent(cache, monkeypatch, number):
 def test_long_compilations_are_told(cache, caplog, monkeypatch):
     CasadiSystem(function(), compile=True)
     assert not caplog.messages
-    monkeypatch.setattr(compiling, "_LARGE_SOURCE", 1000)
+    monkeypatch.setattr(compiling, "LARGE_SOURCE", 1000)
     CasadiSystem(function(factor=3.0), compile=True)
     before, after = caplog.messages
     assert before.startswith("compiling law_y: 0.0 MB of C by ") and str(cache / "cache" / "vtbdrake") in before

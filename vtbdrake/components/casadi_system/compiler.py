@@ -26,10 +26,11 @@ from vtbdrake.state.archive import whole_file
 
 _log = logging.getLogger(__name__)
 
+LARGE_SOURCE = 500_000
+"""Bytes of C code that take so long to compile that the user is told."""
 LONGEST_COMPILATION = 600.0
 """s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
-# Bytes of C code that take so long to compile that the user is told, and how long optimizing compilers take for one.
-_LARGE_SOURCE = 500_000
+# How long optimizing compilers take for a byte of C code, in s.
 _SECONDS_PER_BYTE = 15e-6
 # Runs the compiler "$@" beside a watcher, which reads a line when the compiler has ended. If standard input closes
 # without one, this process has ended, by whatever signal: then the watcher ends the compiler with its children (it
@@ -242,7 +243,7 @@ def compile_library(source: str, library: Path, kernels: Sequence[Path] = ()) ->
         )
     # No other user may write there: the files in the folder are executed.
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    name, is_long, begin = library.stem.partition("-")[0], len(source) > _LARGE_SOURCE, time.monotonic()
+    name, is_long, begin = library.stem.partition("-")[0], len(source) > LARGE_SOURCE, time.monotonic()
     if is_long:
         _log.warning(
             "compiling %s: %.1f MB of C by %s, which may take about %.0f s of processor time; the library is kept in "
