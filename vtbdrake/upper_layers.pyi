@@ -9,7 +9,9 @@ from .deployment.deployment import deploy as deploy
 # A problem is studied.
 from .optimization.study.study import Study as Study
 
-# Comparisons, sweeps, rollouts, decisions and studies are drawn.
+# Calibrations, comparisons, sweeps, rollouts, decisions and studies are drawn.
+from .visualization.calibrations import calibration_html as calibration_html
+from .visualization.calibrations import plot_calibration as plot_calibration
 from .visualization.comparisons import comparison_html as comparison_html
 from .visualization.comparisons import plot_comparison as plot_comparison
 from .visualization.decisions import plot_decision as plot_decision

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.calibration.pendulum import DRIVES, PERIOD, PendulumScenario, recorded
-from tests.calibration.test_calibration import COULOMB, PARAMETERS, TRUTH, calibrated
+from tests.calibration.test_calibration import COULOMB, PARAMETERS, TRUTH, VALUES, calibrated
 from vtbdrake.calibration import Calibration, CalibrationError, JointModel, JointRecording, calibrate, information
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics
@@ -171,6 +171,20 @@ def test_signal_that_the_scenario_does_not_have_is_refused_with_near_names() -> 
     renamed = Log(log.source, {"positon": log.sense["position"]}, log.act)
     with pytest.raises(CalibrationError, match="has no sensor signal positon; did you mean position?"):
         calibrate(PendulumScenario(), renamed, PARAMETERS, position="positon", torque="torque")
+
+
+def test_factors_of_torques_are_those_by_which_they_were_divided() -> None:
+    model = JointModel(PendulumScenario().build(), PARAMETERS)
+    dynamics, z = InverseDynamics(model), np.array([VALUES[each.address] for each in PARAMETERS])
+    recordings = [
+        JointRecording.of(with_columns(pendulum_log(), change), model, position="position", torque="torque")
+        for change in (lambda q, u: (q, u), lambda q, u: (q, u / 3.0))
+    ]
+    assert dynamics.torque_factors(recordings[:1], z) == pytest.approx([1.0], abs=0.02)
+    assert dynamics.torque_factors(recordings[1:], z) == pytest.approx([3.0], rel=0.1)
+    times, torque, needed = dynamics.torques(recordings[0], z)
+    assert times.shape == (len(torque),) and torque.shape == needed.shape
+    assert np.std(needed - torque) < 0.1 * np.std(torque)
 
 
 def test_positions_and_torques_that_are_exchanged_are_refused() -> None:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake import upper_layers
 from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
 from vtbdrake.calibration.fisher import Information, information_of
+from vtbdrake.calibration.fit_curves import FitCurves
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques, currents
@@ -23,10 +27,15 @@ from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import GAP, Log
+from vtbdrake.rollout.executor import watched
 from vtbdrake.state import VariableError
+from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.inertia import INERTIA_SIZE, PHYSICAL, body_function
 from vtbdrake.testbed.pedigree import Number, Posterior
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _log = logging.getLogger(__name__)
 
@@ -102,6 +111,7 @@ class Calibration:
         sources: The recordings.
         remarks: What the checks of the recordings have noticed, as sentences.
         information: What the recordings tell about the parameters, as far as the model holds.
+        curves: The recordings beside the calibrated model, for `plot`.
     """
 
     scenario: Scenario
@@ -116,6 +126,7 @@ class Calibration:
     sources: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     information: Information | None = None
+    curves: FitCurves | None = None
 
     @property
     def accepted(self) -> bool:
@@ -132,7 +143,7 @@ class Calibration:
     def __str__(self) -> str:
         width = max(len(address) for address in self.parameters)
         lines = [
-            self._header(),
+            self.summary,
             f"{'':{width}}       start       value   deviation   interval of 95 %",
         ]
         for each in self.parameters.values():
@@ -142,12 +153,31 @@ class Calibration:
             )
         return "\n".join([*lines, *self.reasons, *self.combinations, *self.remarks])
 
-    def _header(self) -> str:
+    @property
+    def summary(self) -> str:
+        """Return the recordings and the innovations in a line."""
         return (
             f"{counted(len(self.sources), 'recording')}, {counted(self.segments, 'segment')}: innovations "
             f"{self.fit:.3g} (hold-out {self.holdout:.3g}, 1 is expected), largest autocorrelation "
             f"{self.correlation:.2g}"
         )
+
+    def _repr_html_(self) -> str:
+        return upper_layers.calibration_html(self)
+
+    def plot(self) -> Figure:
+        """Return a figure of each joint: torques beside those that the model needs, and the filter's errors.
+
+        Raises:
+            ValueError: The calibration is one by rollouts, which has no such curves.
+        """
+        return upper_layers.plot_calibration(self)
+
+    def save_html(self, path: str | os.PathLike[str]) -> None:
+        """Write one HTML file with the numbers, their verdicts, and plots."""
+        page = f'<!doctype html><meta charset="utf-8"><title>Calibration</title>{self._repr_html_()}'
+        with whole_file(path) as partial:
+            partial.write_text(page, encoding="utf-8")
 
 
 def calibrate(
@@ -163,6 +193,7 @@ def calibrate(
     segment: float = 1.0,
     holdout: float = 0.2,
     noise: Noise | None = None,
+    progress: bool = False,
 ) -> Calibration:
     """Fit parameters of a scenario's plant and drives to recordings.
 
@@ -184,6 +215,7 @@ def calibrate(
         holdout: Share of the segments that are kept back, to compare with.
         noise: The noise, of an earlier calibration of this machine, which is not fitted again: that takes most of the
             time.
+        progress: Whether to show what is computed in a terminal or a notebook; the log has it at the level INFO.
 
     Raises:
         CalibrationError: A parameter is none of the model, a log does not fit the model, or nothing is varied.
@@ -191,8 +223,8 @@ def calibrate(
     if not 0.0 < holdout < 0.9:
         raise CalibrationError(f"the share that is kept back is above 0 and below 0.9, not {holdout}")
     settings = _Settings(position, torque, measured_torque, period, segment, noise)
-    with _one_thread():
-        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings)
+    with _one_thread(), _Progress(shown=progress) as told:
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, told)
         return prepared.fitted(scenario, holdout)
 
 
@@ -230,8 +262,8 @@ def information(
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
     settings = _Settings(position, torque, measured_torque, period, segment, noise)
-    with _one_thread():
-        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings)
+    with _one_thread(), _Progress(shown=False) as told:
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, told)
         z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
         return prepared.information(noise, z)
 
@@ -246,6 +278,31 @@ def _one_thread() -> AbstractContextManager[object]:
 
     limits: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
     return limits
+
+
+class _Progress:
+    """A line that says what is computed, rewritten in a terminal or a notebook, and logged at the level INFO.
+
+    Args:
+        shown: Whether the line is shown, beside the log.
+    """
+
+    def __init__(self, *, shown: bool) -> None:
+        self._shown = shown and watched()
+
+    def __enter__(self) -> Self:
+        from tqdm.auto import tqdm  # Here, because worker processes need none.
+
+        self._bar = tqdm(bar_format="calibration, {elapsed}: {desc}", disable=not self._shown, leave=False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def tell(self, text: str) -> None:
+        """Say what is computed now."""
+        _log.info("%s", text)
+        self._bar.set_description_str(text)
 
 
 @dataclass(frozen=True)
@@ -287,6 +344,7 @@ class _Prepared:
         start: The parameters by inverse dynamics.
         noise: The noise that is given; None: it is found.
         guess: Where the search of the noise begins.
+        progress: Where it is told what is computed.
     """
 
     testbed: VirtualTestbed
@@ -301,6 +359,7 @@ class _Prepared:
     start: Array
     noise: Noise | None
     guess: Noise
+    progress: _Progress
 
     def causes(self) -> list[str]:
         """Return the likely cause of a bad fit, as a sentence, if there is one."""
@@ -314,6 +373,7 @@ class _Prepared:
         parameters: Sequence[Parameter],
         inertias: Sequence[Inertia],
         settings: _Settings,
+        progress: _Progress,
     ) -> _Prepared:
         """Read and check the recordings, and find a start.
 
@@ -327,6 +387,7 @@ class _Prepared:
             raise CalibrationError("there is no recording to calibrate with")
         settings.check()
         position, torque = settings.position, settings.torque
+        progress.tell("building the model")
         testbed = scenario.build()
         model = JointModel(testbed, parameters, inertias, measured_torque=settings.measured_torque)
         if settings.noise is not None:
@@ -334,6 +395,7 @@ class _Prepared:
         whole = [
             JointRecording.of(log, model, position=position, torque=torque, period=settings.period) for log in logs
         ]
+        progress.tell(f"checking {counted(len(logs), 'recording')} by inverse dynamics")
         longest = _LONGEST if model.step_size > 0.0 else GAP
         recordings = [piece for recording in whole for piece in recording.pieces(longest=longest)]
         checks = [check_log(log, scenario.interface(), position=position, torque=torque) for log in logs]
@@ -343,6 +405,7 @@ class _Prepared:
         remarks = tuple(remark for check in checks for remark in check.remarks)
         for remark in remarks:
             _log.warning("%s", remark)
+        progress.tell("compiling a step of the model")
         return cls(
             testbed=testbed,
             model=model,
@@ -356,6 +419,7 @@ class _Prepared:
             start=fit.z,
             noise=settings.noise,
             guess=Noise.guess(recordings, fit.unexplained),
+            progress=progress,
         )
 
     def converged(self, used: NDArray[np.bool]) -> tuple[Array, Noise]:
@@ -366,8 +430,8 @@ class _Prepared:
         try:
             z, noise = self.start, self.noise
             if noise is None:
-                z, noise = _gauss_newton(self.some, z, self.guess, fits_noise=True)
-            return _gauss_newton(self.segments, z, noise, used)
+                z, noise = _gauss_newton(self.some, z, self.guess, self.progress, fits_noise=True)
+            return _gauss_newton(self.segments, z, noise, self.progress, used)
         except CalibrationError as error:
             raise CalibrationError(". ".join([str(error), *self.doubts, *self.causes()])) from error
 
@@ -384,6 +448,7 @@ class _Prepared:
         """
         held_back = kept_back(self.segments.count, holdout)
         z, noise = self.converged(~held_back)
+        self.progress.tell("verdicts: what the model lacks")
         return _result(scenario, self, noise, z, held_back)
 
 
@@ -404,6 +469,7 @@ def _gauss_newton(
     segments: Segments,
     z: Array,
     noise: Noise,
+    progress: _Progress,
     used: NDArray[np.bool] | slice = slice(None),
     *,
     fits_noise: bool = False,
@@ -414,11 +480,13 @@ def _gauss_newton(
         segments: The segments, whose trajectories become the filtered ones.
         z: The parameters to begin with.
         noise: The noise, or where to begin.
+        progress: Where each iteration is told.
         used: The segments that count.
         fits_noise: Take the likeliest noise at the parameters of each iteration.
     """
-    model = segments.model
-    for _ in range(_ITERATIONS):
+    model, purpose = segments.model, "noise and parameters" if fits_noise else "parameters"
+    for number in range(1, _ITERATIONS + 1):
+        progress.tell(f"{purpose} by {counted(segments.count, 'segment')}, iteration {number}, {_ITERATIONS} at most")
         linearized = segments.linearized(z)
         if fits_noise:
             noise = segments.likeliest_noise(linearized, noise)
@@ -439,9 +507,8 @@ def _result(
 ) -> Calibration:
     model, segments, used = prepared.model, prepared.segments, ~held_back
     linearized = segments.linearized(z)
-    innovations = segments.innovations(noise, linearized)
-    white = innovations.white
-    fit, holdout = (_rms(white[:, part]) for part in (used, held_back))
+    white = (innovations := segments.innovations(noise, linearized)).white
+    fit, holdout = _rms(white[:, used]), _rms(white[:, held_back])
     J = innovations.slopes[:, used].reshape(-1, len(z))
     info = information_of(J, model.names, model.scales)
     _check_told(model, info)
@@ -483,6 +550,7 @@ def _result(
         reasons=tuple(reasons),
         remarks=prepared.remarks,
         information=info,
+        curves=FitCurves.of(prepared.recordings, prepared.dynamics, z, segments, white, held_back),
         segments=int(used.sum()),
         sources=tuple(prepared.logs),
     )

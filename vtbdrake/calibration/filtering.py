@@ -308,6 +308,8 @@ class Segments:
         period: The time between two positions, in s.
         steps: Number N of steps of a segment.
         count: Number W of segments.
+        sources: The recording of each segment, (W,).
+        times: Times of the trajectory, (N + 1, W), in s.
         trajectory: The trajectory x, (N + 1, W, 2 nq).
     """
 
@@ -340,10 +342,12 @@ class Segments:
         ]
         self._pieces = pieces[:: ceil(len(pieces) / (most or len(pieces)))]
         self.count = len(self._pieces)
+        self.sources = np.array([i for i, _ in self._pieces])
+        self.times = np.stack([recordings[i].times[span] for i, span in self._pieces], axis=1)
         smoothed = [np.hstack(recording.smoothed()[:2]) for recording in recordings]
         self.trajectory = np.stack([smoothed[i][span] for i, span in self._pieces], axis=1)
         self._q = np.stack([recordings[i].q[span] for i, span in self._pieces], axis=1)
-        self._steps = np.stack([np.diff(recordings[i].times[span]) for i, span in self._pieces], axis=1)
+        self._steps = np.diff(self.times, axis=0)
         self._function = self._compile().map(self.steps * self.count)
 
     def _compile(self) -> casadi.Function:

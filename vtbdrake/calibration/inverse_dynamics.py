@@ -110,18 +110,25 @@ class InverseDynamics:
             recordings: The recordings.
             z: The parameters, (nz,).
         """
-        model = self._model
-        needed_torques, motor_torques = [], []
-        for recording in recordings:
-            smoothed = (part[_ENDS:-_ENDS:_STRIDE].T for part in recording.smoothed())
-            q, v, a = smoothed
-            m = model.motor(recording.times, recording.u, z)[0][_ENDS:-_ENDS:_STRIDE]
-            n = len(m)
-            left = model.unexplained.map(n)(q, v, a, m.T, np.tile(z[:, np.newaxis], (1, n)))
-            motor_torques.append(m)
-            needed_torques.append(np.asarray(left).T @ model.selection + m)
-        tau, needed = np.concatenate(motor_torques), np.concatenate(needed_torques)
+        parts = [self.torques(recording, z) for recording in recordings]
+        tau, needed = (
+            np.concatenate(columns) @ self._model.selection for columns in list(zip(*parts, strict=True))[1:]
+        )
         return np.asarray((tau * needed).sum(axis=0) / np.maximum((tau**2).sum(axis=0), 1e-300))
+
+    def torques(self, recording: JointRecording, z: Array) -> tuple[Array, Array, Array]:
+        """Return times (n,), the motors' torques at the joints and what the model needs for the motion, (n, nq) each.
+
+        Args:
+            recording: The recording, without the ends of which the smoothed positions are bad.
+            z: The parameters, (nz,).
+        """
+        rows, model = slice(_ENDS, -_ENDS, _STRIDE), self._model
+        q, v, a = (part[rows].T for part in recording.smoothed())
+        m = model.motor(recording.times, recording.u, z)[0][rows]
+        lack = model.unexplained.map(len(m))(q, v, a, m.T, np.tile(z[:, np.newaxis], (1, len(m))))
+        torque = m @ model.selection.T
+        return recording.times[rows], torque, np.asarray(lack).T + torque
 
 
 def directions_of(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:

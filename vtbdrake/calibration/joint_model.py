@@ -1,7 +1,7 @@
 r"""The joints of a testbed as one function of its parameters: plant and drives, written in CasADi.
 
 The drives are `JointDrives`: they feel a command one period after it was given and hold the motor's torque during a
-step, and a discrete plant feels it another period later. Their friction is implicit in a discrete plant's step, and
+step, and a discrete plant feels it a step of its own later. Their friction is implicit in a discrete plant's step, and
 continuous in time with a continuous plant. Other than theirs, the delay may be any time, not only whole periods.
 """
 
@@ -297,7 +297,7 @@ class JointModel:
         if not self.drives or self._is_measured:
             return u, np.zeros((len(u), 0, self.nu))
         period, time_constant = float(np.median(np.diff(times))), max(values["time_constant"], 0.0)
-        delay = (max(values["delay"], 0.0) + 1.0 + (self.step_size > 0.0)) * self._drive_period / period
+        delay = ((max(values["delay"], 0.0) + 1.0) * self._drive_period + self.step_size) / period
         whole = min(int(delay), len(u) - 2)
         near, far = _shifted(u, whole), _shifted(u, whole + 1)
         reference = near + (delay - whole) * (far - near)

@@ -342,7 +342,7 @@ def _with_late_column(side: str, k: int, periods: int) -> Callable[[JointRecordi
         synchronous, late = (slice(max(d, 0), max(d, 0) + rows) for d in (-periods, periods))
         columns = {"q": recording.q[synchronous].copy(), "u": recording.u[synchronous].copy()}
         columns[side][:, k] = getattr(recording, side)[late, k]
-        return replace(recording, times=recording.times[synchronous], **columns)
+        return replace(recording, times=recording.times[synchronous], q=columns["q"], u=columns["u"])
 
     return reading
 

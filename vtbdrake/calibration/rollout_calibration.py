@@ -114,7 +114,9 @@ class RolloutCalibration(Calibration):
     losses: Array
     rollouts: int
 
-    def _header(self) -> str:
+    @property
+    def summary(self) -> str:
+        """Return the recordings, the loss and the number of rollouts in a line."""
         outside = "" if self.outside is None else f", {self.outside:.0%} outside ({self.chance:.0%} by chance)"
         return (
             f"{counted(len(self.sources), 'recording')}, {counted(self.segments, 'window')}: loss {self.fit:.4g} "

@@ -56,7 +56,10 @@ def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[
     addresses = [address for address in scenario.build().variables() if address.startswith("sim.act.")]
     paths = [address.removesuffix(".coulomb") for address in addresses if address.endswith(".coulomb")]
     if len(paths) != 1:
-        raise click.UsageError(f"--vary drives is for a scenario with one JointDrives, this one has {len(paths)}")
+        raise click.UsageError(
+            f"--vary drives is for a scenario with one JointDrives, this one has {len(paths)}; a project of `vtbdrake "
+            "new` has them with --field drives=true"
+        )
     signal = next((each for each in scenario.interface().act if each.name == torque), None)
     listed = {each.address for each in parameters if each != _ALL_DRIVES}
     upper = np.inf if signal is None else signal.upper
@@ -96,6 +99,7 @@ def _varied(scenario: Scenario, torque: str, parameters: Sequence[Any]) -> list[
     multiple=True,
 )
 @option("--save FILE", "Write the calibrated scenario: .yaml.", parse=output(".yaml"))
+@option("--html FILE", "Write a page with the numbers, their verdicts and plots: .html.", parse=output(".html"))
 @json_option
 @option("--self-test", "Calibrate simulated machines whose numbers are hidden, instead of LOGS.", is_flag=True)
 @option(
@@ -124,6 +128,7 @@ def calibrate(
     measured_torque: bool,
     period: float | None,
     save: Path | None,
+    html: Path | None,
     self_test: bool,
     values: tuple[Setting, ...],
     trials: int,
@@ -152,8 +157,9 @@ def calibrate(
         raise click.UsageError("give either LOGS or --self-test")
     if values and not self_test:
         raise click.UsageError("--set is for the DPS of a --self-test: the DPS takes no part in the fit of LOGS")
-    if self_test and save is not None:
-        raise click.UsageError("a self-test has nothing to --save: it calibrates machines that do not exist")
+    for name, file in (("save", save), ("html", html)):
+        if self_test and file is not None:
+            raise click.UsageError(f"a self-test has nothing to --{name}: it calibrates machines that do not exist")
     from vtbdrake.calibration import Inertia
     from vtbdrake.calibration import calibrate as fit
     from vtbdrake.calibration import self_test as test
@@ -172,12 +178,15 @@ def calibrate(
         tested = test(scenario, varied, machine=machine, **trial, **model)
         show(tested, _tested(tested))
         return
-    result = fit(scenario, [_read(path, scenario, position, torque, **table) for path in logs], varied, **model)
+    recordings = [_read(path, scenario, position, torque, **table) for path in logs]
+    result = fit(scenario, recordings, varied, progress=True, **model)
     names = ("fit", "holdout", "correlation", "reasons", "combinations", "remarks")
     numbers = {"parameters": [*result.parameters.values()]}
     show(result, numbers | {name: getattr(result, name) for name in names})
     if save is not None:
         result.scenario.save(save)
+    if html is not None:
+        result.save_html(html)
     if not result.accepted:
         refused = [each.address for each in result.parameters.values() if each.verdict != "accepted"]
         raise FailedError(f"not accepted: {', '.join(refused)}")

@@ -215,6 +215,8 @@ def _robot_values(robot: ProjectRobot) -> dict[str, str]:
         # A variable of one entry is a number.
         "entry": "[0]" if len(drives) == 1 else "",
         "driven_position": "np.atleast_1d(position)[INDICES]" if len(joints) == 1 else "position[INDICES]",
+        "position_columns": ",".join(f"q{number}" for number in range(1, len(joints) + 1)),
+        "torque_columns": ",".join(f"u{number}" for number in range(1, len(drives) + 1)),
         "effort_unit": ", ".join(dict.fromkeys("N" if joint.kind == PRISMATIC else "N m" for joint in drives)),
         "scenario_imports": "from pydrake.geometry import CollisionFilterDeclaration\n" if robot.touching else "",
         "robot_names": ", ".join(names),

@@ -169,9 +169,8 @@ def _column(table: Table, name: str, source: str) -> Array:
     else:
         shown = ", ".join(list(table)[:20]) + (", ..." if len(table) > 20 else "")
         remarks = "; ".join(["", *getattr(table, "remarks", ())])
-        raise LogError(
-            f"{source} has no column {name!r}{did_you_mean(name, table)}; it has: {shown or 'none'}{remarks}"
-        )
+        near = did_you_mean(name, table, cutoff=0.5)
+        raise LogError(f"{source} has no column {name!r}{near}; it has: {shown or 'none'}{remarks}")
     try:
         values: Array = np.asarray(column, dtype=float)
     except (TypeError, ValueError) as error:
