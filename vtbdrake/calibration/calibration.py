@@ -223,8 +223,8 @@ def calibrate(
     if not 0.0 < holdout < 0.9:
         raise CalibrationError(f"the share that is kept back is above 0 and below 0.9, not {holdout}")
     settings = _Settings(position, torque, measured_torque, period, segment, noise)
-    with _one_thread(), _Progress(shown=progress) as told:
-        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, told)
+    with _one_thread(), _Progress(shown=progress) as line:
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, line)
         return prepared.fitted(scenario, holdout)
 
 
@@ -262,8 +262,8 @@ def information(
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
     settings = _Settings(position, torque, measured_torque, period, segment, noise)
-    with _one_thread(), _Progress(shown=False) as told:
-        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, told)
+    with _one_thread(), _Progress(shown=False) as line:
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings, line)
         z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
         return prepared.information(noise, z)
 

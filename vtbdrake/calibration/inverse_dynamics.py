@@ -120,7 +120,7 @@ class InverseDynamics:
         """Return times (n,), the motors' torques at the joints and what the model needs for the motion, (n, nq) each.
 
         Args:
-            recording: The recording, without the ends of which the smoothed positions are bad.
+            recording: The recording; its ends, where smoothed positions are bad, are left out.
             z: The parameters, (nz,).
         """
         rows, model = slice(_ENDS, -_ENDS, _STRIDE), self._model
