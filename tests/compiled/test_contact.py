@@ -64,13 +64,18 @@ class Steps:
         q, v, u = model.symbols()
         tau = model.actuation(u)
         step = solver.step(q, v, tau, desired=self._desired(), feed_forward=u if self.drives else None)
-        touching = [self.contact.touch(pair, q) for pair in self.contact.pairs]
+        contacts = self.contact.contacts(q)
+        jacobians = [
+            model.point_jacobian(pair.second.body, contacts.points[:, i], q)
+            - model.point_jacobian(pair.first.body, contacts.points[:, i], q)
+            for i, pair in enumerate(self.contact.pairs)
+        ]
         balance = model.momentum_balance(q, v, tau, plant.time_step())
         parts = [
             *balance,
-            casadi.vertcat(*(J for J, _, _ in touching)),
-            casadi.horzcat(*(n for _, n, _ in touching)),
-            casadi.vertcat(*(distance for _, _, distance in touching)),
+            casadi.vertcat(*jacobians),
+            contacts.normals,
+            contacts.distances,
         ]
         options = {"cse": True}
         self._step = casadi.Function("step", [q, v, u], [casadi.densify(part) for part in step[:4]], options)

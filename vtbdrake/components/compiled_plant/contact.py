@@ -22,7 +22,6 @@ from vtbdrake.components.compiled_plant.links import (
     colliding,
     constant_pose,
     rounding_beside,
-    skew,
     times,
 )
 from vtbdrake.components.compiled_plant.touching import can_touch, is_iterated, touch
@@ -91,23 +90,21 @@ class Contacts(NamedTuple):
     """All contacts that there may be, as expressions: first the pairs, then places for spheres on ground.
 
     Attributes:
-        J: Jacobians of the pairs, see `PointContact.touch`, shape (3 pairs, nv).
+        J_bodies: Angular and linear Jacobians of `PointContact.bodies`, in the world, shape (6 bodies, nv).
+        origins: The origins of these bodies in the world, shape (3, bodies), in m.
         normals: The normals from the first into the second geometry in the world, shape (3, n); ground is the second.
         distances: The distances in m, shape (n, 1).
         material: Stiffness, dissipation and friction, each of shape (n, 1).
         points: Where the forces act in the world, shape (3, n), in m.
-        J_spheres: Angular and linear Jacobians of the spheres' centres, in the world, shape (6 spheres, nv).
-        offsets: The points of the spheres' contacts less their centres, shape (3, spheres * SLOTS), in m.
         doubt: Positive where there are more contacts than places.
     """
 
-    J: Expression
+    J_bodies: Expression
+    origins: Expression
     normals: Expression
     distances: Expression
     material: tuple[Expression, Expression, Expression]
     points: Expression
-    J_spheres: Expression
-    offsets: Expression
     doubt: Expression
 
 
@@ -233,12 +230,15 @@ class PointContact:
     Attributes:
         pairs: What may touch, but for spheres that may touch many fixed pieces.
         grounds: These spheres, with their pieces.
+        bodies: Indices of the bodies that move and may touch.
     """
 
     def __init__(self, plant: MultibodyPlant, model: PlantDynamics, pairs: Sequence[Pair]) -> None:
         self._model = model
         self._is_lagged = is_lagged(plant)
         self.pairs, self.grounds = self._divided(pairs)
+        on_sides = {body for sides in self._sides() for body in sides}
+        self.bodies = tuple(sorted(body for body in on_sides if model.way(body)))
         self._kernels = [self._ground_kernel(ground) for ground in self.grounds]
 
     def is_iterated(self) -> bool:
@@ -246,20 +246,17 @@ class PointContact:
         has_hulls = any(not isinstance(piece.shape, Box) for ground in self.grounds for piece in ground.pieces)
         return has_hulls or any(is_iterated(pair.first.shape, pair.second.shape) for pair in self.pairs)
 
-    @property
-    def sphere_count(self) -> int:
-        """Return the number of spheres on ground."""
-        return sum(len(ground.spheres) for ground in self.grounds)
-
     def materials(self) -> np.ndarray:
         """Return stiffness, dissipation and friction of each pair, shape (n, 3); see `Pair.material`."""
         return np.array([pair.material(is_lagged=self._is_lagged) for pair in self.pairs]).reshape(-1, 3)
 
     def places(self) -> list[list[int]]:
         """Return the places of the velocities that move each contact."""
-        of_pairs = [[*self._model.way(pair.first.body), *self._model.way(pair.second.body)] for pair in self.pairs]
-        of_spheres = [self._model.way(sphere.body) for sphere in self._spheres() for _ in range(SLOTS)]
-        return [sorted(set(places)) for places in (*of_pairs, *of_spheres)]
+        return [sorted({place for body in sides for place in self._model.way(body)}) for sides in self._sides()]
+
+    def sides(self) -> list[list[int]]:
+        """Return the places of both bodies of each contact among `bodies`, -1 of a body that does not move."""
+        return [[self.bodies.index(body) if body in self.bodies else -1 for body in sides] for sides in self._sides()]
 
     def forces_on(self, body: int, forces: Expression, contacts: Contacts) -> Iterator[tuple[Expression, Expression]]:
         """Yield the contact forces on a body: where they act, and what they are; both in the world, shape (3, 1).
@@ -285,8 +282,8 @@ class PointContact:
             q: The positions.
             terrain: The number of the terrain under the spheres on ground, see `terrain`; 0: the plant's own.
         """
-        touching = [self.touch(pair, q) for pair in self.pairs]
-        points = [self._meet(pair, q)[0] for pair in self.pairs]
+        touching = [self._touch(pair, q) for pair in self.pairs]
+        motions = [self._model.body_motion(body, q) for body in self.bodies]
         poses = [self._pose(sphere, q) for sphere in self._spheres()]
         results, start = [], 0
         for ground, kernel in zip(self.grounds, self._kernels, strict=True):
@@ -301,25 +298,25 @@ class PointContact:
             for k, column in enumerate(self.materials().T)
         )
         return Contacts(
-            J=casadi.vertcat(casadi.SX(0, self._model.nv), *(J for J, _, _ in touching)),
+            J_bodies=casadi.vertcat(casadi.SX(0, self._model.nv), *(motion.J for motion in motions)),
+            origins=casadi.horzcat(casadi.SX(3, 0), *(motion.p for motion in motions)),
             normals=casadi.horzcat(casadi.SX(3, 0), *(normal for _, normal, _ in touching), *on_ground[1]),
             distances=casadi.vertcat(casadi.SX(0, 1), *(distance for _, _, distance in touching), *on_ground[0]),
             material=(stiffness, dissipation, friction),
-            points=casadi.horzcat(casadi.SX(3, 0), *points, centers + offsets),
-            J_spheres=casadi.vertcat(casadi.SX(0, self._model.nv), *self._sphere_jacobians(q)),
-            offsets=offsets,
+            points=casadi.horzcat(casadi.SX(3, 0), *(point for point, _, _ in touching), centers + offsets),
             doubt=casadi.SX(casadi.mmax(casadi.vertcat(0.0, *on_ground[6]))),
         )
 
     def _spheres(self) -> list[Surface]:
         return [sphere for ground in self.grounds for sphere in ground.spheres]
 
-    def _sphere_jacobians(self, q: Expression) -> Iterator[Expression]:
-        """Yield the angular and linear Jacobian of the centre of each sphere on ground, shape (6, nv)."""
-        for sphere in self._spheres():
-            motion = self._model.body_motion(sphere.body, q)
-            offset = self._pose(sphere, q)[1] - motion.p
-            yield casadi.vertcat(motion.J[:3, :], motion.J[3:, :] - skew(offset) @ motion.J[:3, :])
+    def _sides(self) -> list[tuple[int, int]]:
+        """Return the indices of the bodies 1 and 2 of each contact."""
+        of_pairs = [(pair.first.body, pair.second.body) for pair in self.pairs]
+        on_ground = [(ground.spheres, ground.pieces[0].body) for ground in self.grounds]
+        return of_pairs + [
+            (sphere.body, fixed) for spheres, fixed in on_ground for sphere in spheres for _ in range(SLOTS)
+        ]
 
     def _divided(self, pairs: Sequence[Pair]) -> tuple[tuple[Pair, ...], tuple[Ground, ...]]:
         """Return the pairs without the spheres that may touch many fixed pieces, and these spheres as grounds."""
@@ -408,7 +405,7 @@ class PointContact:
 
     # -- where it touches
 
-    def _meet(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
+    def _touch(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
         """Return the point of contact and the normal from the first to the second, in the world, and the distance."""
         first, second = pair.first, pair.second
         poses = self._pose(first, q), self._pose(second, q)
@@ -416,24 +413,6 @@ class PointContact:
         on_second = on_first - distance * n
         share = np.array([first.stiffness, second.stiffness]) / (first.stiffness + second.stiffness)
         return share[0] * on_first + share[1] * on_second, -n, distance
-
-    def touch(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
-        """Return Jacobian, normal and distance of a pair.
-
-        Args:
-            pair: The pair.
-            q: Positions, shape (nq, 1).
-
-        Returns:
-            The Jacobian of the velocity of the second geometry against the first, at the point of contact, shape
-            (3, nv); the normal from the first into the second, shape (3, 1), both in the world; and the distance in m,
-            below 0 in contact.
-        """
-        point, normal, distance = self._meet(pair, q)
-        J = self._model.point_jacobian(pair.second.body, point, q) - self._model.point_jacobian(
-            pair.first.body, point, q
-        )
-        return J, normal, distance
 
     def _pose(self, surface: Surface, q: Expression) -> tuple[Expression, Expression]:
         rounding = rounding_beside(np.max(np.abs(surface.X_BG.translation())))

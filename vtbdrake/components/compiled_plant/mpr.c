@@ -54,10 +54,25 @@ static void into_world(const Shape *s, const double *local, double *world) {
     for (int r = 0; r < 3; ++r) world[r] = s->p[r] + s->R[r] * local[0] + s->R[r + 3] * local[1] + s->R[r + 6] * local[2];
 }
 
+/* The outermost vertex of a hull along d, in its frame. */
+static const double *outermost_vertex(const Shape *s, const double *d) {
+    const double *outermost = s->vertices[0];
+    double height = dot(d, outermost);
+    for (int i = 1; i < s->count; ++i) {
+        double other = dot(d, s->vertices[i]);
+        if (other > height) height = other, outermost = s->vertices[i];
+    }
+    return outermost;
+}
+
 /* The outermost point of a shape along sign * direction. */
 static void support(const Shape *s, const double *direction, double sign, double *world) {
     double d[3], local[3] = {0.0, 0.0, 0.0};
     for (int c = 0; c < 3; ++c) d[c] = sign * dot(s->R + 3 * c, direction);
+    if (s->kind == HULL) {
+        into_world(s, outermost_vertex(s, d), world);
+        return;
+    }
     double length = sqrt(dot(d, d)), across = sqrt(d[0] * d[0] + d[1] * d[1]);
     if (s->kind == SPHERE || s->kind == CAPSULE) {
         for (int k = 0; k < 3; ++k) local[k] = s->size[0] * d[k] / length;
@@ -65,13 +80,8 @@ static void support(const Shape *s, const double *direction, double sign, double
     } else if (s->kind == CYLINDER) {
         for (int k = 0; k < 2; ++k) local[k] = is_zero(across) ? 0.0 : s->size[0] * d[k] / across;
         local[2] = is_zero(d[2]) ? 0.0 : d[2] > 0.0 ? s->size[1] : -s->size[1];
-    } else if (s->kind == BOX) {
-        for (int k = 0; k < 3; ++k) local[k] = d[k] >= 0.0 ? s->size[k] : -s->size[k];
     } else {
-        int outermost = 0;
-        for (int i = 1; i < s->count; ++i)
-            if (dot(d, s->vertices[i]) > dot(d, s->vertices[outermost])) outermost = i;
-        memcpy(local, s->vertices[outermost], sizeof local);
+        for (int k = 0; k < 3; ++k) local[k] = d[k] >= 0.0 ? s->size[k] : -s->size[k];
     }
     into_world(s, local, world);
 }

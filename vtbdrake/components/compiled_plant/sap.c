@@ -5,9 +5,10 @@ The velocities v after the step minimize
     1/2 (v - v*)' A (v - v*) + sum over contacts l(J v) + sum over axes l(v_i),
 
 by Newton's method with an exact line search. Iterations begin, proceed and end as Drake's do, at an error of 1e-6 of the
-momentum: what is left of it is the same, too, and does not drive apart what is sensitive. A = M + dt D is factored as L' L along the tree of velocities
-(Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: WAY tells the velocities next to each on the way to the
-root, and each contact moves with velocities of one way. Contact models are those of Drake's discrete plant,
+momentum: what is left of it is the same, too, and does not drive apart what is sensitive. A = M + dt D is factored as
+L' L along the tree of velocities (Featherstone, RBDA, 6.3): WAY[0] tells the velocities next to each on the way to the
+root. So is the Hessian A + sum J' G J, unless a contact between two branches of the tree is active: then along WAY[1],
+longer ways on which every contact moves with velocities of one. Contact models are those of Drake's discrete plant,
 
     SAP:    impulses projected onto the friction cone, with a compliance at least that of near-rigid contact;
     LAGGED: Hunt and Crossley's normal force, and regularized friction under the normal force before the step.
@@ -17,20 +18,19 @@ The frame of a contact has its z along the normal, from body 1 into body 2; velo
 An axis is an impulse on one velocity that falls linearly with it, between two bounds. Stops of joints (Drake's
 SapLimitConstraint) and PD controllers of actuators with their effort limits (SapPdControllerConstraint) are axes.
 
-The text before this one defines NAME; NV, NP, NC, NS, ND: the numbers of velocities, pairs, contacts, joints with stops and
-actuators with a controller; LAGGED: 0 or 1; DT: the time step (s); BETA: the near-rigid threshold; VS: the stiction
-tolerance (m/s); DEPTH[NV] and WAY[NV][NV]; TREE[NV]: the number of the tree of
-joints, below NV, that a velocity belongs to; COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; STOP[NS]: the velocity of
-a joint with stops, LOWER[NS] and UPPER[NS] (rad or m); DRIVE[ND]: the velocity of an actuator, KP[ND], KD[ND] and
-EFFORT[ND] (N m or N). Tables have a row more, because C has no empty ones.
+The text before this one defines NAME; NV, NB, NC, NS, ND: the numbers of velocities, bodies that may touch, contacts,
+joints with stops and actuators with a controller; LAGGED: 0 or 1; DT: the time step (s); BETA: the near-rigid threshold;
+VS: the stiction tolerance (m/s); WAY[2][NV][NV] and their lengths DEPTH[2][NV]; TREE[NV]: the number of the tree of
+joints, below NV, that a velocity belongs to; SIDES[NC][2]: the bodies 1 and 2 of a contact, -1 for one that is fixed;
+COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; IS_BETWEEN[NC]: whether it is between two branches;
+STOP[NS]: the velocity of a joint with stops, LOWER[NS] and UPPER[NS] (rad or m); DRIVE[ND]: the velocity of an actuator,
+KP[ND], KD[ND] and EFFORT[ND] (N m or N). Tables have a row more, because C has no empty ones.
 
-The contacts after those of the NP pairs are places for SLOTS contacts of each of NF spheres with fixed ground.
-
-Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), J (3 NP, NV) in the world, normals
-(3, NC), distances (NC, m, below 0 in contact), stiffness (NC, N/m), dissipation (NC: SAP's time in s, or LAGGED's in s/m),
-friction (NC); the positions of the joints with stops (NS); of the controllers KP (q_d - q) + KD v_d (ND), with the
-position before the step, and the feed-forward actuation (ND); of the centres of the spheres the angular and the linear
-Jacobian (6 NF, NV) in the world, and the points of their contacts less the centre (3, NC - NP, m).
+Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), of the bodies the angular and the
+linear Jacobian (6 NB, NV) in the world, normals (3, NC), distances (NC, m, below 0 in contact), stiffness (NC, N/m),
+dissipation (NC: SAP's time in s, or LAGGED's in s/m), friction (NC); the positions of the joints with stops (NS); of the
+controllers KP (q_d - q) + KD v_d (ND), with the position before the step, and the feed-forward actuation (ND); the
+origins of the bodies (3, NB) and the points of contact (3, NC) in the world (m).
 Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of the controllers (ND, N m or N); and a doubt:
 1 where the iteration did not converge, else 0. */
 
@@ -53,11 +53,15 @@ Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of th
 
 typedef struct {
     int at;                     /* its number among all */
-    double J[3][NV];            /* in the contact's frame; entries of COLUMNS only */
+    int count;                  /* of the velocities that move it, */
+    const int *columns;         /* which are these */
+    double J[3][NV];            /* in the contact's frame, a column for each of them */
     double R_WC[3][3];          /* columns: two tangents, the normal */
     double mu, k, d, phi;
-    double Rt, Rn, vn_hat;      /* SAP */
+    double Gt, Gn, vn_hat;      /* SAP: 1 / R of the tangents and the normal (N s^2/m), and where the latter is at rest, */
+    double mu_hat, slide;       /* mu Rt / Rn, and 1 / (1 + mu mu_hat) */
     double n0, eps;             /* LAGGED */
+    double vc[3], G[3][3];      /* of the last gradient: its velocity, and what its impulse falls by with it */
 } Contact;
 
 typedef struct {
@@ -75,41 +79,43 @@ typedef struct {
     Axis axes[2 * NS + ND + 1];
     int contact_count, axis_count;
     int takes_part[NV];                      /* by tree: whether it has a contact or an axis; else, v = v* there */
+    int ways;                                /* of the Hessian: 1 if an active contact is between two branches */
 } Problem;
 
-/* Factor H = L' L in place, along the tree. Return 0 if H is not positive definite. */
-static int factor(double (*H)[NV]) {
+/* Factor H = L' L in place, along WAY[ways]; the diagonal becomes 1 / L_kk. Return 0 if H is not positive definite. */
+static int factor(double (*H)[NV], int ways) {
+    const int *depth = DEPTH[ways];
     for (int k = NV - 1; k >= 0; --k) {
         if (!(H[k][k] > 0.0)) return 0;
-        double d = sqrt(H[k][k]);
-        H[k][k] = d;
-        double row[NV];
-        for (int a = 0; a < DEPTH[k]; ++a) row[a] = H[k][WAY[k][a]] /= d;
-        for (int a = 0; a < DEPTH[k]; ++a) {
-            double *below = H[WAY[k][a]];
-            for (int b = a; b < DEPTH[k]; ++b) below[WAY[k][b]] -= row[a] * row[b];
+        double row[NV], scale = H[k][k] = 1.0 / sqrt(H[k][k]);
+        for (int a = 0; a < depth[k]; ++a) row[a] = H[k][WAY[ways][k][a]] *= scale;
+        for (int a = 0; a < depth[k]; ++a) {
+            double *below = H[WAY[ways][k][a]];
+            for (int b = a; b < depth[k]; ++b) below[WAY[ways][k][b]] -= row[a] * row[b];
         }
     }
     return 1;
 }
 
-static void solve(double (*L)[NV], double *x) {
+static void solve(double (*L)[NV], int ways, double *x) {
+    const int *depth = DEPTH[ways];
     for (int i = NV - 1; i >= 0; --i) {
-        x[i] /= L[i][i];
-        for (int a = 0; a < DEPTH[i]; ++a) x[WAY[i][a]] -= L[i][WAY[i][a]] * x[i];
+        x[i] *= L[i][i];
+        for (int a = 0; a < depth[i]; ++a) x[WAY[ways][i][a]] -= L[i][WAY[ways][i][a]] * x[i];
     }
     for (int i = 0; i < NV; ++i) {
-        for (int a = 0; a < DEPTH[i]; ++a) x[i] -= L[i][WAY[i][a]] * x[WAY[i][a]];
-        x[i] /= L[i][i];
+        for (int a = 0; a < depth[i]; ++a) x[i] -= L[i][WAY[ways][i][a]] * x[WAY[ways][i][a]];
+        x[i] *= L[i][i];
     }
 }
 
+/* y = A x, along the tree of joints. */
 static void multiply(double (*A)[NV], const double *x, double *y) {
     memset(y, 0, NV * sizeof *y);
     for (int i = 0; i < NV; ++i) {
         double sum = A[i][i] * x[i];
-        for (int a = 0; a < DEPTH[i]; ++a) {
-            int j = WAY[i][a];
+        for (int a = 0; a < DEPTH[0][i]; ++a) {
+            int j = WAY[0][i][a];
             sum += A[i][j] * x[j];
             y[j] += A[i][j] * x[i];
         }
@@ -139,11 +145,9 @@ static void frame(const double *n, double (*R)[3]) {
 }
 
 static void contact_velocity(const Contact *c, const double *v, double *vc) {
-    const int *columns = COLUMNS[c->at];
-    for (int r = 0; r < 3; ++r) {
-        vc[r] = 0.0;
-        for (int m = 0; m < COUNT[c->at]; ++m) vc[r] += c->J[r][columns[m]] * v[columns[m]];
-    }
+    vc[0] = vc[1] = vc[2] = 0.0;
+    for (int m = 0; m < c->count; ++m)
+        for (int r = 0; r < 3; ++r) vc[r] += c->J[r][m] * v[c->columns[m]];
 }
 
 /* The impulse g at the velocity vc, and G = -dg/dvc, symmetric. */
@@ -163,23 +167,22 @@ static void impulse(const Contact *c, const double *vc, double *g, double (*G)[3
     for (int r = 0; r < 2; ++r)
         for (int s = 0; s < 2; ++s) G[r][s] = c->mu * c->n0 * ((r == s) - t[r] * t[s]) / soft;
 #else
-    double y[3] = {-vc[0] / c->Rt, -vc[1] / c->Rt, (c->vn_hat - vc[2]) / c->Rn};
-    double yr = sqrt(y[0] * y[0] + y[1] * y[1] + SOFT_TOLERANCE * SOFT_TOLERANCE), mu_hat = c->mu * c->Rt / c->Rn;
+    double y[3] = {-vc[0] * c->Gt, -vc[1] * c->Gt, (c->vn_hat - vc[2]) * c->Gn};
+    double yr = sqrt(y[0] * y[0] + y[1] * y[1] + SOFT_TOLERANCE * SOFT_TOLERANCE);
     if (yr <= c->mu * y[2]) { /* it sticks */
         memcpy(g, y, 3 * sizeof *g);
-        G[0][0] = G[1][1] = 1.0 / c->Rt;
-        G[2][2] = 1.0 / c->Rn;
-    } else if (-mu_hat * yr < y[2]) { /* it slides */
-        double f = 1.0 / (1.0 + c->mu * mu_hat), t[2] = {y[0] / yr, y[1] / yr};
-        g[2] = f * (y[2] + mu_hat * yr);
+        G[0][0] = G[1][1] = c->Gt;
+        G[2][2] = c->Gn;
+    } else if (-c->mu_hat * yr < y[2]) { /* it slides */
+        double t[2] = {y[0] / yr, y[1] / yr};
+        g[2] = c->slide * (y[2] + c->mu_hat * yr);
         for (int r = 0; r < 2; ++r) {
             g[r] = c->mu * g[2] * t[r];
-            G[r][2] = c->mu * f * t[r] / c->Rn;
-            G[2][r] = mu_hat * f * t[r] / c->Rt;
+            G[r][2] = G[2][r] = c->mu * c->slide * t[r] * c->Gn;
             for (int s = 0; s < 2; ++s)
-                G[r][s] = c->mu * (g[2] / yr * ((r == s) - t[r] * t[s]) + mu_hat * f * t[r] * t[s]) / c->Rt;
+                G[r][s] = c->mu * c->Gt * (g[2] / yr * ((r == s) - t[r] * t[s]) + c->mu_hat * c->slide * t[r] * t[s]);
         }
-        G[2][2] = f / c->Rn;
+        G[2][2] = c->slide * c->Gn;
     } else {
         g[0] = g[1] = g[2] = 0.0;
     }
@@ -198,58 +201,58 @@ static double axis_impulse(const Axis *a, double v, double *slope) {
 
 /* What does not change in the iteration; v0 are the velocities before the step. */
 static void prepare(Contact *c, const double *scale, const double *v0) {
-    const int *columns = COLUMNS[c->at], count = COUNT[c->at];
     double square = 0.0;
     for (int r = 0; r < 3; ++r)
-        for (int s = 0; s < 3; ++s) {
+        for (int s = 0; s <= r; ++s) {
             double entry = 0.0;
-            for (int m = 0; m < count; ++m) {
-                int i = columns[m];
-                entry += c->J[r][i] * c->J[s][i] * scale[i];
-            }
-            square += entry * entry;
+            for (int m = 0; m < c->count; ++m) entry += c->J[r][m] * c->J[s][m] * scale[c->columns[m]];
+            square += (s < r ? 2.0 : 1.0) * entry * entry;
         }
     double w = sqrt(square) / 3.0; /* Drake's estimate of J A^-1 J', by the diagonal of A */
-    c->Rt = SIGMA * w;
+    double Rt = SIGMA * w;
 #if LAGGED
     double vc[3];
     contact_velocity(c, v0, vc);
     c->n0 = fmax(0.0, -DT * c->k * c->phi) * fmax(0.0, 1.0 - c->d * vc[2]);
-    c->eps = fmax(VS, c->mu * c->Rt * c->n0);
+    c->eps = fmax(VS, c->mu * Rt * c->n0);
 #else
     (void)v0;
     double near_rigid = BETA * BETA / (4.0 * M_PI * M_PI) * w;
-    c->Rn = fmax(near_rigid, 1.0 / (DT * c->k * (DT + c->d)));
+    double Rn = fmax(near_rigid, 1.0 / (DT * c->k * (DT + c->d)));
+    c->Gt = 1.0 / Rt, c->Gn = 1.0 / Rn, c->mu_hat = c->mu * Rt / Rn, c->slide = 1.0 / (1.0 + c->mu * c->mu_hat);
     c->vn_hat = -c->phi / (DT + c->d);
 #endif
 }
 
 /* The velocity of body 2 against body 1 at a contact for each unit of the velocity i, in the world. */
 static void column(const double *const *in, int at, int i, double *J) {
-    if (at < NP) {
-        memcpy(J, in[3] + 3 * at + 3 * NP * i, 3 * sizeof *J);
-        return;
+    memset(J, 0, 3 * sizeof *J);
+    for (int side = 0; side < 2; ++side) {
+        int body = SIDES[at][side];
+        if (body < 0) continue;
+        const double *w = in[3] + 6 * body + 6 * NB * i, *v = w + 3, *origin = in[12] + 3 * body, *point = in[13] + 3 * at;
+        double sign = side ? 1.0 : -1.0, r[3];
+        for (int k = 0; k < 3; ++k) r[k] = point[k] - origin[k];
+        J[0] += sign * (v[0] + w[1] * r[2] - w[2] * r[1]);
+        J[1] += sign * (v[1] + w[2] * r[0] - w[0] * r[2]);
+        J[2] += sign * (v[2] + w[0] * r[1] - w[1] * r[0]);
     }
-    int slot = at - NP;
-    const double *w = in[12] + 6 * (slot / SLOTS) + 6 * NF * i, *v = w + 3, *r = in[13] + 3 * slot;
-    J[0] = -(v[0] + w[1] * r[2] - w[2] * r[1]);
-    J[1] = -(v[1] + w[2] * r[0] - w[0] * r[2]);
-    J[2] = -(v[2] + w[0] * r[1] - w[1] * r[0]);
 }
 
 static void add_contacts(Problem *p, const double *const *in, const double *v0) {
     for (int at = 0; at < NC; ++at) {
         if (!(in[5][at] <= 0.0)) continue;
         Contact *c = p->contacts + p->contact_count++;
-        *c = (Contact){.at = at, .phi = in[5][at], .k = in[6][at], .d = in[7][at], .mu = in[8][at]};
+        c->at = at, c->count = COUNT[at], c->columns = COLUMNS[at];
+        c->phi = in[5][at], c->k = in[6][at], c->d = in[7][at], c->mu = in[8][at];
         frame(in[4] + 3 * at, c->R_WC);
-        for (int m = 0; m < COUNT[at]; ++m) {
-            int i = COLUMNS[at][m];
+        for (int m = 0; m < c->count; ++m) {
             double J[3];
-            column(in, at, i, J);
-            for (int r = 0; r < 3; ++r) c->J[r][i] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
+            column(in, at, c->columns[m], J);
+            for (int r = 0; r < 3; ++r) c->J[r][m] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
         }
         prepare(c, p->scale, v0);
+        p->ways |= IS_BETWEEN[at];
     }
 }
 
@@ -282,46 +285,65 @@ static void add_drives(Problem *p, const double *pull, const double *feed_forwar
     }
 }
 
-/* The gradient of the cost at v, and its Hessian along the tree; return the square of the impulses' norm. */
-static double gradient(Problem *p, const double *v, double *grad, double (*H)[NV]) {
-    double d[NV], impulses[NV] = {0.0}, square = 0.0;
+/* What tells whether the iteration has converged, as in Drake. */
+typedef struct {
+    double gradient, momentum, impulses;
+} Norms;
+
+/* The gradient of the cost at v, and its norms. */
+static Norms gradient(Problem *p, const double *p_star, const double *v, double *grad) {
+    double d[NV], impulses[NV] = {0.0}, slope;
+    Norms norms = {0.0, 0.0, 0.0};
+    for (int a = 0; a < p->contact_count; ++a) {
+        Contact *c = p->contacts + a;
+        double g[3];
+        contact_velocity(c, v, c->vc);
+        impulse(c, c->vc, g, c->G);
+        for (int m = 0; m < c->count; ++m)
+            impulses[c->columns[m]] += c->J[0][m] * g[0] + c->J[1][m] * g[1] + c->J[2][m] * g[2];
+    }
+    for (int a = 0; a < p->axis_count; ++a)
+        impulses[p->axes[a].v] += axis_impulse(p->axes + a, v[p->axes[a].v], &slope);
     for (int i = 0; i < NV; ++i) d[i] = v[i] - p->v_star[i];
     multiply(p->A, d, grad);
+    for (int i = 0; i < NV; ++i) {
+        double momentum = grad[i] + p_star[i];
+        grad[i] -= impulses[i];
+        norms.impulses += impulses[i] * impulses[i] * p->scale[i];
+        if (!p->takes_part[TREE[i]]) continue;
+        norms.gradient += grad[i] * grad[i] * p->scale[i];
+        norms.momentum += momentum * momentum * p->scale[i];
+    }
+    return norms;
+}
+
+/* The Hessian of the cost at v, where its gradient was taken last; its lower half. */
+static void hessian(const Problem *p, const double *v, double (*H)[NV]) {
     memcpy(H, p->A, sizeof p->A);
     for (int a = 0; a < p->contact_count; ++a) {
         const Contact *c = p->contacts + a;
-        const int *columns = COLUMNS[c->at], count = COUNT[c->at];
-        double vc[3], g[3], G[3][3], W[3][NV];
-        contact_velocity(c, v, vc);
-        impulse(c, vc, g, G);
-        for (int m = 0; m < count; ++m) {
-            int i = columns[m];
-            impulses[i] += c->J[0][i] * g[0] + c->J[1][i] * g[1] + c->J[2][i] * g[2];
-            for (int r = 0; r < 3; ++r) W[r][m] = G[r][0] * c->J[0][i] + G[r][1] * c->J[1][i] + G[r][2] * c->J[2][i];
+        double W[3][NV];
+        for (int m = 0; m < c->count; ++m)
+            for (int r = 0; r < 3; ++r)
+                W[r][m] = c->G[r][0] * c->J[0][m] + c->G[r][1] * c->J[1][m] + c->G[r][2] * c->J[2][m];
+        for (int m = 0; m < c->count; ++m) { /* columns increase */
+            double *row = H[c->columns[m]];
+            for (int l = 0; l <= m; ++l)
+                row[c->columns[l]] += c->J[0][m] * W[0][l] + c->J[1][m] * W[1][l] + c->J[2][m] * W[2][l];
         }
-        for (int m = 0; m < count; ++m) /* columns increase: the lower half */
-            for (int l = 0; l <= m; ++l) {
-                int i = columns[m];
-                H[i][columns[l]] += c->J[0][i] * W[0][l] + c->J[1][i] * W[1][l] + c->J[2][i] * W[2][l];
-            }
     }
     for (int a = 0; a < p->axis_count; ++a) {
         int i = p->axes[a].v;
         double slope;
-        impulses[i] += axis_impulse(p->axes + a, v[i], &slope);
+        axis_impulse(p->axes + a, v[i], &slope);
         H[i][i] += slope;
     }
-    for (int i = 0; i < NV; ++i) {
-        grad[i] -= impulses[i];
-        square += impulses[i] * impulses[i] * p->scale[i];
-    }
-    return square;
 }
 
 /* A direction from v, and what is needed for the slope of the cost along it. */
 typedef struct {
     double v[NV], direction[NV], Ap[NV], dAp, pAp;
-    double begin[NC + 1][3], along[NC + 1][3]; /* velocities of contacts */
+    double along[NC + 1][3];    /* the same of contacts */
 } Line;
 
 /* Return the slope of the cost after a step along a line, and its curvature. */
@@ -331,7 +353,7 @@ static double slope_after(const Problem *p, const Line *line, double step, doubl
     for (int a = 0; a < p->contact_count; ++a) {
         const double *along = line->along[a];
         double vc[3], g[3], G[3][3];
-        for (int r = 0; r < 3; ++r) vc[r] = line->begin[a][r] + step * along[r];
+        for (int r = 0; r < 3; ++r) vc[r] = p->contacts[a].vc[r] + step * along[r];
         impulse(p->contacts + a, vc, g, G);
         for (int r = 0; r < 3; ++r) {
             slope -= g[r] * along[r];
@@ -353,10 +375,7 @@ static double line_search(Problem *p, Line *line, double slope0) {
     multiply(p->A, line->direction, line->Ap);
     for (int i = 0; i < NV; ++i) d[i] = line->v[i] - p->v_star[i];
     line->dAp = dot(d, line->Ap), line->pAp = dot(line->direction, line->Ap);
-    for (int a = 0; a < p->contact_count; ++a) {
-        contact_velocity(p->contacts + a, line->v, line->begin[a]);
-        contact_velocity(p->contacts + a, line->direction, line->along[a]);
-    }
+    for (int a = 0; a < p->contact_count; ++a) contact_velocity(p->contacts + a, line->direction, line->along[a]);
     if (!(slope0 < 0.0)) return NAN;
     if (slope_after(p, line, LONGEST_STEP, &curvature) < SLOPE_TOLERANCE * -slope0) return LONGEST_STEP;
     double step = fmin(-slope0 / curvature, LONGEST_STEP), tolerance = SLOPE_TOLERANCE * step;
@@ -382,24 +401,20 @@ static double line_search(Problem *p, Line *line, double slope0) {
 }
 
 /* Iterate from the velocities before the step; return whether it converges. */
-static int minimize(Problem *p, double *v) {
-    double H[NV][NV], grad[NV], A_v[NV];
+static int minimize(Problem *p, const double *p_star, double *v) {
+    double H[NV][NV], grad[NV];
     Line line;
     for (int i = 0; i < NV; ++i)
         if (!p->takes_part[TREE[i]]) v[i] = p->v_star[i];
     for (int k = 0; k <= MOST_ITERATIONS; ++k) {
-        double impulses = gradient(p, v, grad, H), residual = 0.0, momentum = 0.0;
-        multiply(p->A, v, A_v);
-        for (int i = 0; i < NV; ++i) {
-            if (!p->takes_part[TREE[i]]) continue;
-            residual += grad[i] * grad[i] * p->scale[i];
-            momentum += A_v[i] * A_v[i] * p->scale[i];
-        }
-        if (!isfinite(momentum + impulses)) return 0;
-        if (sqrt(residual) <= 1e-14 + TOLERANCE * sqrt(fmax(momentum, impulses))) return 1;
-        if (k == MOST_ITERATIONS || !factor(H)) return 0;
+        Norms norms = gradient(p, p_star, v, grad);
+        if (!isfinite(norms.momentum + norms.impulses)) return 0;
+        if (sqrt(norms.gradient) <= 1e-14 + TOLERANCE * sqrt(fmax(norms.momentum, norms.impulses))) return 1;
+        if (k == MOST_ITERATIONS) return 0;
+        hessian(p, v, H);
+        if (!factor(H, p->ways)) return 0;
         for (int i = 0; i < NV; ++i) line.direction[i] = -grad[i];
-        solve(H, line.direction);
+        solve(H, p->ways, line.direction);
         memcpy(line.v, v, sizeof line.v);
         double step = line_search(p, &line, dot(grad, line.direction));
         if (!(step > 0.0)) return 0;
@@ -422,29 +437,27 @@ static void write_forces(const Problem *p, const double *v, double *forces) {
 
 /* Set up the problem of one step from the arguments, and solve it; return whether that worked. */
 static int take_step(const double **arg, Problem *p, double *v) {
-    static const double none[3 * NC * NV + 6 * NF * NV + NV * NV + NS + ND + 1] = {0.0};
+    static const double none[3 * NC + 6 * NB * NV + NV * NV + NS + ND + 1] = {0.0};
     const double *in[ARGUMENTS];
     for (int i = 0; i < ARGUMENTS; ++i) in[i] = arg[i] ? arg[i] : none; /* CasADi's way to say that all are zero */
     double L[NV][NV];
-    p->contact_count = p->axis_count = 0;
-    for (int i = 0; i < NV; ++i) {
-        for (int j = 0; j < NV; ++j) p->A[i][j] = in[0][i + NV * j];
-        p->scale[i] = 1.0 / p->A[i][i];
-    }
+    p->contact_count = p->axis_count = p->ways = 0;
+    memcpy(p->A, in[0], sizeof p->A); /* symmetric */
+    for (int i = 0; i < NV; ++i) p->scale[i] = 1.0 / p->A[i][i];
     memcpy(L, p->A, sizeof L);
     memcpy(p->v_star, in[1], sizeof p->v_star);
     memcpy(v, in[2], sizeof p->v_star);
-    if (!factor(L)) return 0;
-    solve(L, p->v_star);
+    if (!factor(L, 0)) return 0;
+    solve(L, 0, p->v_star);
     add_contacts(p, in, in[2]);
     add_stops(p, in[2], in[9]);
     add_drives(p, in[10], in[11]);
     if (p->contact_count + p->axis_count) {
         memset(p->takes_part, 0, sizeof p->takes_part);
         for (int a = 0; a < p->contact_count; ++a)
-            for (int m = 0, at = p->contacts[a].at; m < COUNT[at]; ++m) p->takes_part[TREE[COLUMNS[at][m]]] = 1;
+            for (int m = 0; m < p->contacts[a].count; ++m) p->takes_part[TREE[p->contacts[a].columns[m]]] = 1;
         for (int a = 0; a < p->axis_count; ++a) p->takes_part[TREE[p->axes[a].v]] = 1;
-        return minimize(p, v);
+        return minimize(p, in[1], v);
     }
     memcpy(v, p->v_star, sizeof p->v_star);
     return 1;

@@ -17,7 +17,6 @@ from pydrake.multibody.tree import JointActuator
 from vtbdrake.components.casadi_system.compiler import compiled_kernel, kernel_signature
 from vtbdrake.components.compiled_plant.contact import Contacts, PointContact, is_lagged
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
-from vtbdrake.components.compiled_plant.ground import SLOTS
 from vtbdrake.state.multibody import bodies
 
 Expression = Any  # casadi.SX
@@ -84,7 +83,7 @@ class Solution(NamedTuple):
         v_next: Velocities after the step, shape (nv, 1).
         forces: Forces on the other geometry of each of the pairs in contact, in the world, shape (3, n), in N.
         efforts: Actuation of the drives, feed-forward included and within the effort limits, shape (m, 1), in N m or N.
-        doubt: Positive where the iteration did not converge, or a sphere touches more than `SLOTS` pieces of ground.
+        doubt: Positive where the iteration did not converge, or a sphere touches too many pieces of ground.
         contacts: The contacts that were taken into account.
     """
 
@@ -157,15 +156,15 @@ class SapSolver:
             A,
             p_star,
             v,
-            contacts.J,
+            contacts.J_bodies,
             contacts.normals,
             contacts.distances,
             *contacts.material,
             q[[stop.q for stop in self._stops]],
             casadi.vertcat(casadi.SX(0, 1), *pulls),
             casadi.SX.zeros(len(drives), 1) if feed_forward is None else feed_forward,
-            contacts.J_spheres,
-            contacts.offsets,
+            contacts.origins,
+            contacts.points,
         )
         v_next, forces, efforts, doubt = self._kernel(*map(casadi.densify, arguments))
         forces = casadi.reshape(forces, 3, contacts.distances.numel())
@@ -174,21 +173,23 @@ class SapSolver:
     def _source(self) -> tuple[str, str]:
         """Return the name and the C code of the kernel for this plant."""
         nv, stops, drives = self._model.nv, self._stops, self._drives
-        places, pairs, spheres = self._contact.places(), len(self._contact.pairs), self._contact.sphere_count
-        n, parents = len(places), self._elimination_tree(self._contact.places())
-        ways = [_way(parents, row) for row in range(nv)]
+        places, count = self._contact.places(), len(self._contact.bodies)
+        n, bodies_of = len(places), [self._model.way(int(body.index())) for body in bodies(self._plant)]
+        trees = [_elimination_tree(cliques, nv) for cliques in (bodies_of, [*bodies_of, *places])]
+        ways = [[_way(parents, row) for row in range(nv)] for parents in trees]
         text = "".join(
             (
-                f"#include <math.h>\n#define NV {nv}\n#define NP {pairs}\n#define NC {n}\n#define NS {len(stops)}\n",
+                f"#include <math.h>\n#define NV {nv}\n#define NB {count}\n#define NC {n}\n#define NS {len(stops)}\n",
                 f"#define ND {len(drives)}\n#define LAGGED {int(is_lagged(self._plant))}\n",
                 f"#define DT {self._plant.time_step()!r}\n#define VS {_STICTION_TOLERANCE!r}\n",
                 f"#define BETA {self._plant.get_sap_near_rigid_threshold()!r}\n",
-                f"#define NF {spheres}\n#define SLOTS {SLOTS}\n",
-                _table("int DEPTH", [len(way) for way in ways]),
-                f"static const int WAY[NV + 1][NV + 1] = {{{', '.join([*map(_row, ways), '{0}'])}}};\n",
+                f"static const int DEPTH[2][NV + 1] = {{{', '.join(_row([*map(len, each), 0]) for each in ways)}}};\n",
+                f"static const int WAY[2][NV + 1][NV + 1] = {{{', '.join(_rows(each) for each in ways)}}};\n",
                 _table("int TREE", self._trees()),
+                f"static const int SIDES[NC + 1][2] = {_rows(self._contact.sides())};\n",
                 _table("int COUNT", [len(row) for row in places]),
-                f"static const int COLUMNS[NC + 1][NV] = {{{', '.join([*map(_row, places), '{0}'])}}};\n",
+                f"static const int COLUMNS[NC + 1][NV] = {_rows(places)};\n",
+                _table("int IS_BETWEEN", [int(not _is_on_way(row, ways[0])) for row in places]),
                 _table("int STOP", [stop.v for stop in stops]),
                 _table("double LOWER", [stop.lower for stop in stops]),
                 _table("double UPPER", [stop.upper for stop in stops]),
@@ -204,14 +205,14 @@ class SapSolver:
             (nv, nv),
             (nv, 1),
             (nv, 1),
-            (3 * pairs, nv),
+            (6 * count, nv),
             (3, n),
             *[(n, 1)] * 4,
             (len(stops), 1),
             (m, 1),
             (m, 1),
         ]
-        shapes_in += [(6 * spheres, nv), (3, n - pairs)]
+        shapes_in += [(3, count), (3, n)]
         shapes_out = [(nv, 1), (3, n), (m, 1), (1, 1)]
         name = f"sap_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
         source = f"#define NAME {name}\n{text}{kernel_signature(name, shapes_in, shapes_out)}"
@@ -238,10 +239,6 @@ class SapSolver:
         order = sorted(set(trees.values()))
         return [order.index(trees[place]) for place in range(self._model.nv)]
 
-    def _elimination_tree(self, places: Sequence[Sequence[int]]) -> list[int]:
-        ways = [self._model.way(int(body.index())) for body in bodies(self._plant)]
-        return _elimination_tree([*ways, *places], self._model.nv)
-
 
 def _elimination_tree(cliques: Sequence[Sequence[int]], size: int) -> list[int]:
     """Return the row next to each on the way to the root, -1 at a root, where rows of a clique are coupled.
@@ -266,6 +263,16 @@ def _way(parents: Sequence[int], row: int) -> list[int]:
     while (row := parents[row]) >= 0:
         way.append(row)
     return way
+
+
+def _is_on_way(places: Sequence[int], ways: Sequence[Sequence[int]]) -> bool:
+    """Return whether sorted places lie on the way from the last of them to the root."""
+    return not places or set(places[:-1]) <= set(ways[places[-1]])
+
+
+def _rows(rows: Sequence[Sequence[int]]) -> str:
+    """Return the C initializer of a table, with a row of 0 at its end."""
+    return f"{{{', '.join(map(_row, [*rows, [0]]))}}}"
 
 
 def _row(numbers: ArrayLike) -> str:

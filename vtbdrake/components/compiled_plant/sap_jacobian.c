@@ -43,7 +43,7 @@ int JACOBIAN(const double **arg, double **res, long long int *iw, double *w, int
     double v[NV], grad[NV], H[NV][NV], slope;
     take_step(arg, &p, v);
     gradient(&p, v, grad, H);
-    int works = factor(H);
+    int works = factor(H, p.ways);
     for (int o = 0; o < 4; ++o) {
         double **block = res + ARGUMENTS * o;
         for (int i = 0; i < ARGUMENTS; ++i)
@@ -53,7 +53,7 @@ int JACOBIAN(const double **arg, double **res, long long int *iw, double *w, int
             const Axis *drive = o == 2 ? p.axes + p.axis_count - ND + row : 0;
             if (drive) axis_impulse(drive, v[drive->v], &slope);
             by_momentum[drive ? drive->v : row] = drive ? -slope / DT : 1.0;
-            solve(H, by_momentum);
+            solve(H, p.ways, by_momentum);
             write_row(&p, v, by_momentum, drive, block, row, rows[o]);
         }
     }
