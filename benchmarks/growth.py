@@ -26,8 +26,8 @@ from vtbdrake.optimization.pareto import undominated
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import RewindableReplay, replay
-from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutTask
-from vtbdrake.rollout.executor import Parameters
+from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutTask, SerialExecutor
+from vtbdrake.rollout.executor import Parameters, run_rollouts
 from vtbdrake.testbed import Interface, Scenario, Signal
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.web.study.study_feed import StudyFeed
@@ -309,6 +309,26 @@ def growth_testbed_systems(largest: int = 1000) -> list[Benchmark]:
         _growth("growth_testbed_bodies", "bodies of a plant", sizes, lambda n: lambda: use(bodies=n)),
         _growth("growth_testbed_parameters", "parameters that are set", sizes, write),
     ]
+
+
+def growth_recorded_variables(largest: int = 1000) -> Benchmark:
+    """Measure a rollout of 80 bodies that records some of their variables at each of 200 steps."""
+    testbed = _Large(bodies=80).build()
+    addresses = [address for address in testbed.variables() if address.startswith("sim.sys.body_")]
+    executor = SerialExecutor(testbed)
+
+    def prepare(count: int) -> Callable[[], Any]:
+        recorded = addresses[:count]
+        task = RolloutTask(testbed.scenario, 0.2, record=recorded, sample_period=1e-3)
+
+        def roll_out() -> None:
+            (result,) = run_rollouts(executor, task, [{}], progress=False)
+            assert result is not None and len(result.record) == count
+
+        return roll_out
+
+    with executor:
+        return _growth("growth_recorded_variables", "variables that a rollout records", _sizes(largest), prepare)
 
 
 # -- campaigns

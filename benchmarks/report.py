@@ -87,6 +87,7 @@ BENCHMARKS: Registry = {
     "growth_study_append": "benchmarks.growth:growth_study_append",
     "growth_log_open": "benchmarks.growth:growth_log_open",
     "growth_testbed_systems": "benchmarks.growth:growth_testbed_systems",
+    "growth_recorded_variables": "benchmarks.growth:growth_recorded_variables",
     "growth_campaign": "benchmarks.growth:growth_campaign",
     "first_picture": "benchmarks.first_picture:first_picture",
     "bare_to_browser": "benchmarks.first_picture:bare_to_browser",
