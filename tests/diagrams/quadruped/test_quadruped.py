@@ -16,7 +16,7 @@ from vtbdrake_diagrams.quadruped.dps import PERCEIVED
 from vtbdrake_diagrams.quadruped.gait import OFFSETS, Trot, desired_state
 from vtbdrake_diagrams.quadruped.model import LEGS, QUADRUPED_SDF, Quadruped, quadruped_sdf
 from vtbdrake_diagrams.quadruped.scenario import present_angles, present_rates, present_trunk
-from vtbdrake_diagrams.quadruped.studies.pushes import PushCase, draw_pushes, fall_time, has_fallen
+from vtbdrake_diagrams.quadruped.studies.pushes import PushCase, Raibert, draw_pushes, fall_time, has_fallen
 
 ROBOT, TROT, PLAN = Quadruped(), Trot(), Spline("linear", 4, 0.45)
 
@@ -121,6 +121,22 @@ def test_pushes_of_all_sizes_have_the_same_directions() -> None:
     small, large = (draw_pushes(impulse, 5) for impulse in (10.0, 20.0))
     assert small == [replace(push, impulse=10.0) for push in large]
     assert len({push.direction for push in small}) == 5 and draw_pushes(10.0, 5, seed=1) != small
+
+
+@pytest.mark.parametrize(("time", "pair"), [(0.05, 0), (0.25, 1)])
+def test_raiberts_rule_moves_the_pair_that_swings_with_the_speed(testbed, time: float, pair: int) -> None:
+    context, yaw, slip = testbed.default_context(), 0.7, np.array([0.3, -0.2])
+    context.SetTime(time)
+    state = np.array(testbed.read(context, PERCEIVED))
+    state[:4] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+    velocity = np.array([0.2, 0.1])
+    state[22:24] = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ (velocity + slip)
+    testbed.write(context, {PERCEIVED: state, "u.velocity": velocity})
+    Raibert(testbed, gain=0.5)(context)
+    plan = testbed.read(context, "u.plan")
+    knots, expected = plan[1:].reshape(-1, len(OFFSETS)), np.zeros(len(OFFSETS))
+    expected[2 * pair : 2 * pair + 2] = 0.5 * slip
+    assert plan[0] == time and np.allclose(knots, expected, atol=1e-12)
 
 
 def test_the_cost_is_zero_where_it_trots_as_it_should() -> None:
