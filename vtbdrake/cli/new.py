@@ -10,7 +10,8 @@ from vtbdrake.cli.options import option, package_option
 from vtbdrake.cli.output import emit, json_option, say
 
 
-def _next_commands(name: str) -> list[tuple[str, str]]:
+def _next_commands(name: str, *, has_fixed_base: bool) -> list[tuple[str, str]]:
+    calibration = ("vtbdrake calibrate --help", "fit drives and masses to a log, see README.md")
     return [
         (f"cd {name}", "the project's folder"),
         ('pip install -e ".[test]"', f"its short name, {name}, for the commands below"),
@@ -19,6 +20,7 @@ def _next_commands(name: str) -> list[tuple[str, str]]:
         (f"vtbdrake rollout {name} --horizon 3", "simulate it"),
         (f"python -m {name}.optimize", "the best gains"),
         (f"python -m {name}.drive", "drive a simulated machine"),
+        *([calibration] if has_fixed_base else []),
     ]
 
 
@@ -57,6 +59,7 @@ def new(name: str, file: str | None, packages: tuple[tuple[str, Path], ...], sta
     for note in source.notes:
         click.echo(f"note: {note}", err=True)
     say(f"{project.name}/ written, for {source}. Next:")
-    for command, purpose in _next_commands(name):
+    is_arm = isinstance(source, ProjectRobot) and source.flying is None and source.standing is None
+    for command, purpose in _next_commands(name, has_fixed_base=is_arm):
         say(f"  {command:<38} # {purpose}")
     emit({"folder": project, "source": source, "assumptions": assumptions, "notes": source.notes})
