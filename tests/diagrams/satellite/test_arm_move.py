@@ -93,9 +93,8 @@ def test_a_plan_has_a_free_knot():
         MoveSpace(knots=4)
 
 
-@pytest.mark.parametrize(
-    "solve", [pytest.param(plan_by_casadi, marks=[pytest.mark.one_python, pytest.mark.slow]), plan_by_drake]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", [pytest.param(plan_by_casadi, marks=pytest.mark.one_python), plan_by_drake])
 def test_solvers_find_a_plan_that_turns_the_base_back(move, solve):
     plan = solve(move, attempts=1)
     assert move.excess(plan.knots) == {}

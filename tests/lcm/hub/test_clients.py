@@ -24,7 +24,7 @@ def test_backlog_arrives_complete_and_in_order_except_dropped() -> None:
     client, sock = connected_pair()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     hub = ClientConnection(sock, max_message=MAX_QUEUE, max_queue=MAX_QUEUE, now=0.0, user=None)
-    sent, received, dropped = [], b"", 0
+    sent, received, dropped = [], bytearray(), 0
     with client, sock:
         client.setblocking(False)
         for _ in range(2000):
@@ -42,7 +42,7 @@ def test_backlog_arrives_complete_and_in_order_except_dropped() -> None:
             received += receive_some(client)
             hub.flush(0.0)
         received += receive_some(client)
-    whole = [part + b"\xff" for part in received.split(b"\xff")[:-1]]
+    whole = [bytes(part) + b"\xff" for part in received.split(b"\xff")[:-1]]
     assert received.endswith(b"\xff")
     numbers = [int(part[:5]) for part in whole]
     assert numbers == sorted(set(numbers))
