@@ -211,3 +211,12 @@ def test_import_loads_nothing_heavy(use: str) -> None:
     code = f"import sys, vtbdrake; {use}; print(*sorted({HEAVY!r} & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.split() == []
+
+
+@pytest.mark.slow
+def test_calibration_loads_what_is_slow_to_load_when_it_is_used() -> None:
+    """scipy.signal and scipy.stats take longer to load than all the rest."""
+    slow = {"scipy.signal", "scipy.stats"}
+    code = f"import sys, vtbdrake.calibration.calibration; print(*sorted({slow!r} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.split() == []

@@ -144,11 +144,11 @@ def scenario_of(tests: dict[str, Any]) -> vtb.Scenario:
     return next(v for v in tests.values() if isinstance(v, type) and issubclass(v, vtb.Scenario))()
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.slow, pytest.mark.one_python])
+        pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.one_python])
         for name in sorted({*ROBOTS, *STATIONS} - {*CHECKED})
     ],
 )

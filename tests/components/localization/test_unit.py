@@ -55,7 +55,7 @@ def test_a_carrier_without_a_guess_is_found_and_tracked():
     np.testing.assert_array_equal(answers[-1].X_OH, one.reckoned[-1])
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_a_kidnapped_carrier_is_lost_and_found_again(errors):
     one, other = drive(3, errors, reach=18.0), drive(3, errors, reach=18.0, step=0.5, scans=60, start=(20.0, 40.0))

@@ -32,6 +32,7 @@ def poses(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(Servicer().lower, Servicer().upper, (count, 7))
 
 
+@pytest.mark.slow
 def test_spheres_are_never_farther_than_the_shapes(arm, drake):
     """Beyond 6 cm, there are pairs of links that no spheres stand for, as they cannot come closer."""
     q = poses(4000)
