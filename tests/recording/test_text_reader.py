@@ -83,6 +83,7 @@ def test_columns_of_a_text(path: Path, text: bytes, columns: dict[str, list[floa
         (b"t,q\n0\n1,2\n", "row 0 has 1 columns, not 2"),
         (b"t  q\n0  1\n1\n2  3\n", "row 1 has 1 columns, not 2"),
         (b"t,q\n0,004,0,1\n0,008,0,2\n", "row 0 has 4 columns, but there are 2 names: decimal commas"),
+        (b"t,q\n0,004e+00,0,1e-02\n0,008e+00,0,2e-02\n", "row 0 has 4 columns, but there are 2 names: decimal commas"),
         (b"t,q\n0,1,2\n0.1,2,3\n", "row 0 has 3 columns, but there are 2 names: decimal commas"),
         (b"run 7, noon\nt,q,u\n0,1,2.5\n", "row 0 has 3 columns, but there are 2 names: is there a line above"),
         (b"Run of the arm\nt,q\n0,1\n", r"row 0 has 1 columns, not 4 .*Begin it with #"),

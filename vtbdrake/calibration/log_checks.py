@@ -93,8 +93,7 @@ def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> 
         raise CalibrationError(
             f"{log.source}: no entry of {position} ever changes, so that nothing can be told: it is "
             f"{np.array2string(q.values[0], separator=', ', precision=6)} in {len(q)} samples. Either the robot stood "
-            "still (command a motion), or the columns are not what its sensors measured (in a simulation, "
-            f"sim.sense.{position}.... moves, real.sense.{position} does not)"
+            "still (command a motion), or the columns are not what its sensors measured"
         )
     _check_turns(log.source, position, q)
     remarks = list(log.remarks)

@@ -210,7 +210,10 @@ def checked_series(label: str, times: Array, values: Array, remarks: list[str]) 
     if not (len(values) and np.isfinite(values).all()):
         whole = np.asarray(np.isfinite(values).all(axis=1))
         if not whole.any():
-            raise LogError(f"{label} has no row that is whole")
+            raise LogError(
+                f"{label} has no row that is whole: in each, an entry is NaN or empty (as those of "
+                "real.sense in a simulation, whose measurements are sim.sense)"
+            )
         remarks.append(f"{label}: {int((~whole).sum())} of {len(whole)} rows are not whole")
         times, values = times[whole], values[whole]
     series = Series.with_last_of_equal_times(times, values)

@@ -139,7 +139,7 @@ def _check_width(fields: Sequence[str], row: int, path: Path, layout: _Layout) -
     if not any(field.strip() for field in fields[len(layout.names) :]):
         return
     cause = ": is there a line above the names that is no comment (#), or a column without a name?"
-    if layout.separator == "," and all(re.fullmatch(r"\s*[+-]?\d*\s*", field) for field in fields):
+    if layout.separator == "," and all(re.fullmatch(r"\s*[+-]?\d*(?:[eE][+-]?\d+)?\s*", field) for field in fields):
         cause = (
             ": decimal commas cannot be told from commas between columns; write decimal points, or separate the "
             "columns by semicolons"
