@@ -26,6 +26,15 @@ COMMAND = "IIWA_COMMAND"
 PATIENCE = 120.0  # s
 AGAINST = "the whole testbed, run on the same machine from the same snapshot"
 
+IMPORTS = {
+    "Python": "pass",
+    "NumPy": "import numpy",
+    "Drake's systems": "import pydrake.systems.framework, pydrake.systems.primitives, pydrake.systems.analysis",
+    "its plant": "import pydrake.multibody.plant",
+    "the scenario": "import vtbdrake_diagrams.manipulator.scenario",
+}
+"""What a process imports before it builds the DPS, each beside all before it."""
+
 
 def dps_alone_start(repeats: int = 3) -> list[Benchmark]:
     """From the start of the process to the first command, and resident memory then: ``vtbdrake run`` from a snapshot
@@ -38,15 +47,39 @@ def dps_alone_start(repeats: int = 3) -> list[Benchmark]:
         with MachineProcess(scenario, hub.url, values=FRICTION):
             alone, whole = _measure(hub.url, snapshot, repeats=repeats, lock=False)
             alone_locked, whole_locked = _measure(hub.url, snapshot, repeats=1, lock=True)
+    ladder = _imports()
     return [
-        _row("dps_alone_start", "s", alone[:, 0], whole[:, 0]),
-        _row("dps_alone_memory", "MB", alone[:, 1], whole[:, 1]),
+        _row("dps_alone_start", "s", alone[:, 0], whole[:, 0], note=_ladder_text(ladder[:, 0], "s")),
+        _row("dps_alone_memory", "MB", alone[:, 1], whole[:, 1], note=_ladder_text(ladder[:, 1], "MB")),
         _row("dps_alone_memory_locked", "MB", alone_locked[:, 1], whole_locked[:, 1]),
     ]
 
 
-def _row(name: str, unit: str, alone: np.ndarray, whole: np.ndarray) -> Benchmark:
-    note = f"DPS alone {spread(alone, unit=unit)}; whole testbed {spread(whole, unit=unit)}"
+def _imports() -> np.ndarray:
+    """(seconds, megabytes) of a process with each of `IMPORTS` and those before it, shape (imports, 2)."""
+    rows = []
+    lines = list(IMPORTS.values())
+    for count in range(1, len(lines) + 1):
+        begin = time.monotonic()
+        program = "\n".join([*lines[:count], "print(flush=True)", "input()"])
+        with subprocess.Popen(
+            [sys.executable, "-c", program], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            rows.append((time.monotonic() - begin, resident(process.pid)))
+            process.communicate("\n")
+    return np.array(rows)
+
+
+def _ladder_text(totals: np.ndarray, unit: str) -> str:
+    return "; with " + ", then ".join(
+        f"{name} {total:.3g} {unit}" for name, total in zip(IMPORTS, totals, strict=True)
+    )
+
+
+def _row(name: str, unit: str, alone: np.ndarray, whole: np.ndarray, note: str = "") -> Benchmark:
+    note = f"DPS alone {spread(alone, unit=unit)}; whole testbed {spread(whole, unit=unit)}{note}"
     return Benchmark(
         name=name, value=ratio(alone, whole), unit="1", goal=None, better=LOWER, against=AGAINST, note=note
     )

@@ -25,25 +25,24 @@ AXLE = -0.8
 """The x coordinate in B of the rear axle, which is not steered, in m."""
 
 
-def make_deployment(scans: LcmMap, *, period: float) -> Deployment:
+def make_deployment(maps: Mapping[LcmMap, float]) -> Deployment:
     """Return the deployment of the localization unit on its carrier: after a fault, the advised route stays.
 
     Signals of numbers are sent as ``lcmt_scope``; scans or images are sent before them in the cycle of the carrier.
 
     Args:
-        scans: The map of the messages of scans or images.
-        period: Time from scan to scan, or from image to image, in s.
+        maps: The maps of the messages of scans and images, with the time from one to the next in s.
     """
     return Deployment(
         protocol=Protocol(
             sense=[
-                scans,
+                *maps,
                 vector_map("ODOMETRY", lcmt_scope, {"odometry": "value"}),
                 vector_map("IMU", lcmt_scope, {"imu": "value"}),
             ],
             act=[vector_map("ROUTE_COMMAND", lcmt_scope, {"route": "value"})],
             commands=[vector_map("ROUTE", lcmt_scope, {"route": "value"})],
-            periods={scans.channel: period},
+            periods={each.channel: period for each, period in maps.items()},
         ),
         period=PERIOD,
         guards={"fallback": {"route": Hold()}},

@@ -2,7 +2,7 @@
 
 A scan is dated by the clock of the DPS when it arrives (`Arrival`). The slow part ``localizer`` takes it one period
 later: the history of the dead reckoning, which then ends one period before the arrival, reaches the scan's time. Pairs
-of images may take the place of scans (`vtbdrake_diagrams.forest.stereo`), in the same way.
+of images may take the place of scans (`vtbdrake_diagrams.forest.stereo`), or come beside them, in the same way.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, System
+from pydrake.systems.primitives import Adder
 from threadpoolctl import ThreadpoolController
 
 from vtbdrake.common.arrays import Array
@@ -30,7 +31,7 @@ from vtbdrake.components.localization.dead_reckoning import (
     deskewed,
     history_size,
 )
-from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.landmarks import Landmarks, Sighting
 from vtbdrake.components.localization.planar import chord, compose, inverse, rotation
 from vtbdrake.components.localization.unit import (
     LOST,
@@ -91,40 +92,71 @@ class ScanLandmarks:
 
 
 @dataclass(frozen=True, eq=False)
+class LandmarkSensor:
+    """A sensor of a localization unit, and how landmarks are detected with it.
+
+    Attributes:
+        detect: The function that returns the landmarks in a scan or in images, such as `ScanLandmarks`.
+        signals: The signals that ``detect`` takes, before the history and the time.
+        field_of_view: Its horizontal field of view in rad.
+        is_scan: Whether its ranges have the bias that the tracker estimates, see `Sighting`.
+    """
+
+    detect: Callable[..., Landmarks]
+    signals: tuple[str, ...] = ("scan",)
+    field_of_view: float = 2.0 * np.pi
+    is_scan: bool = True
+
+    def times(self, inputs: Mapping[str, Any]) -> list[float]:
+        """Return the times of its samples in s, among the inputs of a `Localizer`."""
+        return [float(inputs[f"{name}_time"][0]) for name in self.signals]
+
+    def sighting(self, inputs: Mapping[str, Any], history: Array) -> Sighting:
+        """Return what it detects, from the inputs of a `Localizer`.
+
+        Samples of different times do not fit together: then nothing is detected, nor before `SETTLED`.
+        """
+        times = self.times(inputs)
+        sees = min(times) == max(times) >= SETTLED
+        samples = [inputs[name] for name in self.signals]
+        landmarks = self.detect(*samples, history, times[0]) if sees else Landmarks.empty()
+        return Sighting(landmarks, self.field_of_view, self.is_scan)
+
+
+@dataclass(frozen=True, eq=False)
 class Localizer:
     """The localization from landmarks to the pose: the function of the slow part ``localizer``.
 
     Attributes:
-        detect: The function that returns the landmarks in a scan or in images, such as `ScanLandmarks`.
+        sensors: The sensors of the unit. What they see is fused in the order of its times.
         unit: The localization on the map.
-        signals: The signals that ``detect`` takes, before the history and the time.
     """
 
-    detect: Callable[..., Landmarks]
+    sensors: tuple[LandmarkSensor, ...]
     unit: LocalizationUnit
-    signals: tuple[str, ...] = ("scan",)
 
     def prepare(self) -> None:
-        """Find the libraries of linear algebra, and load what ``detect`` needs."""
+        """Find the libraries of linear algebra, and load what the detectors need."""
         _blas()
-        getattr(self.detect, "prepare", lambda: None)()
+        for sensor in self.sensors:
+            getattr(sensor.detect, "prepare", lambda: None)()
 
     def __call__(
         self, *, request: Array, history: Array, memory: UnitState, **inputs: Any
     ) -> tuple[dict[str, Any], UnitState]:
         """Return the outputs of the slow part, and the memory of the unit.
 
-        ``seen`` holds the samples of the signals and their times, such as ``scan`` and ``scan_time``. Samples of
-        different times do not fit together: then nothing is detected, nor before `SETTLED`.
+        ``inputs`` has the samples of the signals and their times, such as ``scan`` and ``scan_time``. Each sample of
+        a sensor is used once: what is not newer than the last answer is left out.
         """
-        times = [float(inputs[f"{name}_time"][0]) for name in self.signals]
-        taken, sees = times[0], min(times) == max(times) >= SETTLED
+        groups = self._groups(inputs, after=memory.answer.time)
         with _blas().limit(limits=1, user_api="blas"):
-            samples = [inputs[name] for name in self.signals]
-            landmarks = self.detect(*samples, history, taken) if sees else Landmarks.empty()
-            pose = carrier_pose_at(history, taken)
-            X_OH = [pose.x, pose.y, pose.heading]
-            answer, memory = self.unit.step(memory, landmarks, X_OH=X_OH, time=taken)
+            for taken, sensors in groups:
+                sightings = [sensor.sighting(inputs, history) for sensor in sensors]
+                pose = carrier_pose_at(history, taken)
+                X_OH = [pose.x, pose.y, pose.heading]
+                answer, memory = self.unit.step(memory, sightings, X_OH=X_OH, time=taken)
+        landmarks = Landmarks.joined([sighting.landmarks for sighting in sightings])
         outputs = {
             "pose": answer.pose,
             "covariance": answer.covariance.ravel(),
@@ -138,6 +170,17 @@ class Localizer:
             "landmarks": shown(landmarks),
         }
         return outputs, memory
+
+    def _groups(self, inputs: Mapping[str, Any], *, after: float) -> list[tuple[float, list[LandmarkSensor]]]:
+        """Return the sensors with new samples, by the times of these, in their order.
+
+        If none is new, the last ones: the unit ignores and counts them.
+        """
+        by_time: dict[float, list[LandmarkSensor]] = {}
+        for sensor in self.sensors:
+            by_time.setdefault(sensor.times(inputs)[0], []).append(sensor)
+        groups = sorted(by_time.items(), key=lambda item: item[0])
+        return [group for group in groups if group[0] > after] or groups[-1:]
 
 
 @cache
@@ -318,7 +361,12 @@ def add_localizer(
         builder.Connect(arrival.GetOutputPort("sample"), part.GetInputPort(name))
         builder.Connect(arrival.GetOutputPort("time"), part.GetInputPort(f"{name}_time"))
         builder.ExportInput(arrival.GetInputPort("signal"), name)
-    # The number of the last signal is the request, as all signals arrive together or in this order.
-    builder.Connect(arrival.GetOutputPort("number"), part.GetInputPort("request"))
+    # The signals of a sensor arrive together or in their order: the number of its last one counts its samples. The sum
+    # over the sensors is the request.
+    request = builder.AddNamedSystem("arrivals", Adder(len(localizer.sensors), 1))
+    for port, sensor in enumerate(localizer.sensors):
+        arrival = builder.GetSubsystemByName(f"{sensor.signals[-1]}_arrival")
+        builder.Connect(arrival.GetOutputPort("number"), request.get_input_port(port))
+    builder.Connect(request.get_output_port(), part.GetInputPort("request"))
     builder.Connect(reckoning.GetOutputPort("history"), part.GetInputPort("history"))
     return part

@@ -25,17 +25,18 @@ from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
 from vtbdrake.components.world_model import GeoJsonError, WorldModel, load_geojson
 from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.sensor_messages import image_array_map, scan_map
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
-from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
+from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer, ScanLandmarks
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig, StereoLandmarks, add_stereo
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route
 from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.world.vegetation import Vegetation
 
-PERCEPTIONS = ("scanner", "stereo")
+PERCEPTIONS = ("scanner", "stereo", "both")
 
 # The least standard deviation of ranges, in m, that a detector assumes, also of a scanner with exact ranges.
 _LEAST_RANGE_NOISE = 0.005
@@ -199,13 +200,13 @@ class CarrierScenario(Scenario):
             )
 
     @property
-    def perception_period(self) -> float:
-        """The period of the sensor that detects landmarks, in s."""
-        return 1.0 / self.scanner.frequency
+    def perception_periods(self) -> tuple[float, ...]:
+        """The period of each of the `sensors`, in s."""
+        return (1.0 / self.scanner.frequency,)
 
     def perception_signals(self) -> list[Signal]:
-        """Return the signals of the sensor that detects landmarks."""
-        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.perception_period)]
+        """Return the signals of the sensors that detect landmarks."""
+        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency)]
 
     def interface(self) -> Interface:
         routes = range(len(self.routes()))
@@ -221,7 +222,11 @@ class CarrierScenario(Scenario):
 
     @abstractmethod
     def detector(self) -> Callable[..., Landmarks]:
-        """Return the function that detects landmarks in scans or images, see `Localizer`."""
+        """Return the function that detects landmarks in scans, see `LandmarkSensor`."""
+
+    def sensors(self) -> tuple[LandmarkSensor, ...]:
+        """Return the sensors that detect landmarks."""
+        return (LandmarkSensor(self.detector(), field_of_view=self.scanner.azimuth),)
 
     def scanner_accuracy(self) -> dict[str, float]:
         """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
@@ -254,11 +259,11 @@ class CarrierScenario(Scenario):
             if self.map_file:
                 raise GeoJsonError(f"{self.map_file}: {error}") from error
             raise
-        localizer = Localizer(self.detector(), unit, tuple(signals))
+        localizer = Localizer(self.sensors(), unit)
         return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
-        return make_deployment(scan_map("SCAN", "scan"), period=self.perception_period)
+        return make_deployment({scan_map("SCAN", "scan"): 1.0 / self.scanner.frequency})
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
@@ -329,12 +334,13 @@ class CarrierScenario(Scenario):
 class ForestScenario(CarrierScenario):
     """A carrier in a forest stand with strip roads; the landmarks are trees.
 
-    With ``perception="stereo"``, a pair of cameras takes the place of the scanner, and the trees have bark.
+    With ``perception="stereo"``, a pair of cameras takes the place of the scanner, and the trees have bark; with
+    ``"both"``, the unit has scanner and cameras, and fuses what they see in one filter.
     """
 
     landmark: ClassVar[str] = "tree"
 
-    perception: str = setting("scanner", "The sensor that detects trees.", choices=PERCEPTIONS)
+    perception: str = setting("scanner", "The sensor that detects trees, or both.", choices=PERCEPTIONS)
     # The pair of cameras.
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
@@ -381,48 +387,67 @@ class ForestScenario(CarrierScenario):
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world.geometry import add_forest
 
-        textured = self.perception == "stereo"
+        textured = self.has_stereo
         add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
 
+    @property
+    def has_scanner(self) -> bool:
+        """Whether the unit has the scanner."""
+        return self.perception != "stereo"
+
+    @property
+    def has_stereo(self) -> bool:
+        """Whether the unit has the pair of cameras."""
+        return self.perception != "scanner"
+
     def check_perception(self) -> None:
-        if self.perception == "scanner":
+        if self.has_scanner:
             super().check_perception()
-        else:
+        if self.has_stereo:
             self.stereo.check()
 
     @property
-    def perception_period(self) -> float:
-        return super().perception_period if self.perception == "scanner" else 1.0 / self.stereo.fps
+    def perception_periods(self) -> tuple[float, ...]:
+        of_cameras = (1.0 / self.stereo.fps,) if self.has_stereo else ()
+        return (*(super().perception_periods if self.has_scanner else ()), *of_cameras)
 
     def perception_signals(self) -> list[Signal]:
-        if self.perception == "scanner":
-            return super().perception_signals()
-        from pydrake.systems.sensors import ImageRgba8U
+        signals = super().perception_signals() if self.has_scanner else []
+        if self.has_stereo:
+            from pydrake.systems.sensors import ImageRgba8U
 
-        image = ImageRgba8U(self.stereo.width, self.stereo.height)
-        return [Signal(name, model_value=image, max_age=5.0 * self.perception_period) for name in IMAGES]
+            image = ImageRgba8U(self.stereo.width, self.stereo.height)
+            signals += [Signal(name, model_value=image, max_age=5.0 / self.stereo.fps) for name in IMAGES]
+        return signals
 
-    def detector(self) -> Callable[..., Landmarks]:
-        if self.perception == "scanner":
-            return ScanLandmarks(detect_trunks, TrunkDetectorConfig(**self.scanner_accuracy()), self.X_BL)
-        X_BC = self.X_BL @ self.stereo.poses()[IMAGES[0]]
-        return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetectorConfig(), X_BC)
+    def detector(self) -> ScanLandmarks:
+        return ScanLandmarks(detect_trunks, TrunkDetectorConfig(**self.scanner_accuracy()), self.X_BL)
+
+    def sensors(self) -> tuple[LandmarkSensor, ...]:
+        scanner = super().sensors() if self.has_scanner else ()
+        if not self.has_stereo:
+            return scanner
+        camera, X_BC = self.stereo.camera(), self.X_BL @ self.stereo.poses()[IMAGES[0]]
+        detect = StereoLandmarks(camera, self.stereo.matcher(), StereoTrunkDetectorConfig(), X_BC)
+        return (*scanner, LandmarkSensor(detect, IMAGES, field_of_view=camera.fov_x, is_scan=not scanner))
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         unit = super().unit(world_map)
-        if self.perception == "scanner":
+        if self.has_scanner:
             return unit
         tracker = replace(unit.tracker, field_of_view=self.stereo.camera().fov_x)
         return replace(unit, tracker=tracker, begins_with_submap=True)
 
     def deployment(self) -> Deployment:
-        if self.perception == "scanner":
-            return super().deployment()
-        images = image_array_map("IMAGES", {name: name for name in IMAGES})
-        return make_deployment(images, period=self.perception_period)
+        maps: dict[LcmMap, float] = {}
+        if self.has_scanner:
+            maps[scan_map("SCAN", "scan")] = 1.0 / self.scanner.frequency
+        if self.has_stereo:
+            maps[image_array_map("IMAGES", {name: name for name in IMAGES})] = 1.0 / self.stereo.fps
+        return make_deployment(maps)
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
-        if self.perception == "scanner":
+        if self.has_scanner:
             super().add_perception(builder)
-        else:
+        if self.has_stereo:
             add_stereo(builder, builder.plant.GetFrameByName("scanner"), self.stereo)

@@ -21,7 +21,7 @@ from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.world_model import WorldModel, load_geojson
 from vtbdrake.state import AddressedSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
-from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_localizer
+from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer, PresentPose, add_localizer
 from vtbdrake_diagrams.park.world import SteeredCar, TreeDetector, random_trees, surveyed_trees, tree_model
 
 PERIOD = 0.025
@@ -132,7 +132,8 @@ class ParkScenario(Scenario):
         builder, env = DiagramBuilder(), DiagramBuilder()
         env.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
         reckoning = env.AddNamedSystem("dead_reckoning", SteeringReckoning(period=PERIOD, config=self.car))
-        localizer = Localizer(DetectedTrees(self.detector), self.unit(world_map), ("trees",))
+        sensor = LandmarkSensor(DetectedTrees(self.detector), ("trees",))
+        localizer = Localizer((sensor,), self.unit(world_map))
         part = add_localizer(
             env,
             reckoning,

@@ -22,11 +22,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Any, Self, TypeVar
 
 import click
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.framework import Context
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
@@ -34,11 +35,12 @@ from threadpoolctl import threadpool_limits
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
-from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.landmarks import Sighting
 from vtbdrake.components.localization.planar import wrap
-from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit
+from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit, Seen
+from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.forest.dps import PERIOD
-from vtbdrake_diagrams.forest.perception import SETTLED
+from vtbdrake_diagrams.forest.perception import LandmarkSensor
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
@@ -89,14 +91,14 @@ class Drive:
         times: The times of the scans in s, shape (n,).
         truth: The true poses X_WH, shape (n, 3).
         reckoned: The poses X_OH by dead reckoning, shape (n, 3).
-        landmarks: The detections of each scan, in H; n of them.
+        landmarks: The detections of each scan, in H, or what several sensors see at that time; n of them.
         tilts: Errors of roll and pitch by the dead reckoning in rad, shape (n, 2); (0, 2) for a simulated drive.
     """
 
     times: Array
     truth: Array
     reckoned: Array
-    landmarks: tuple[Landmarks, ...]
+    landmarks: tuple[Seen, ...]
     tilts: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
@@ -215,20 +217,19 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     Raises:
         RuntimeError: The drive takes more than twice the time that it should.
     """
-    testbed, detect = scenario.build(), scenario.detector()
-    arrivals = [_ARRIVAL.format(signal=signal.name) for signal in scenario.perception_signals()]
-    pose, time, history = (testbed.reader(address) for address in (_POSE, f"{arrivals[-1]}.time", _HISTORY))
-    samples = [testbed.reader(f"{arrival}.sample") for arrival in arrivals]
+    testbed = scenario.build()
+    pose, history = (testbed.reader(address) for address in (_POSE, _HISTORY))
+    sensors = [_SensorReader.of(testbed, sensor) for sensor in scenario.sensors()]
     simulator = testbed.simulator()
     context = simulator.get_mutable_context()
     testbed.write(context, {_SPEED: 0.0})
-    period = scenario.perception_period
     limit = STANDING + 2.0 * length / scenario.speed + 10.0
     rows: list[tuple[float, Array, Array, Array]] = []
-    landmarks: list[Landmarks] = []
+    seen: list[Seen] = []
     travelled = 0.0
-    while travelled < length:
-        due = (len(rows) + 1) * period
+    for due, shown in _due(scenario.perception_periods):
+        if travelled >= length:
+            break
         if due > limit:
             raise RuntimeError(f"the carrier has driven {travelled:.1f} m of {length:g} m in {limit:.0f} s")
         # Just before the plant steps to its next state: due may be later than that by a rounding error.
@@ -238,17 +239,56 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         x, y, _, roll, pitch, yaw = pose(context)
         # By then the sample has arrived, and its time lies within the history.
         simulator.AdvanceTo(due + 2.0 * PERIOD)
-        taken, past = float(time(context)), history(context)
+        taken, past = sensors[shown[0]].time(context), history(context)
         reckoned_pose = carrier_pose_at(past, taken)
         X_OH = np.array([reckoned_pose.x, reckoned_pose.y, reckoned_pose.heading])
         tilt = np.array([reckoned_pose.roll - roll, reckoned_pose.pitch - pitch])
         rows.append((taken, np.array([x, y, yaw]), X_OH, tilt))
-        inputs = [sample(context) for sample in samples]
-        landmarks.append(detect(*inputs, past, taken) if taken >= SETTLED else Landmarks.empty())
+        seen.append([sensors[which].sighting(context, past) for which in shown])
         if len(rows) > 1:
             travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
     times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
-    return Drive(times, truths, reckoned, tuple(landmarks), tilts)
+    return Drive(times, truths, reckoned, tuple(seen), tilts)
+
+
+@dataclass(frozen=True)
+class _SensorReader:
+    """The reading of what a sensor of the unit shows to the DPS.
+
+    Attributes:
+        sensor: The sensor.
+        inputs: The functions that read samples and their times, by the names of the inputs of a `Localizer`.
+    """
+
+    sensor: LandmarkSensor
+    inputs: Mapping[str, Callable[[Context], Any]]
+
+    @classmethod
+    def of(cls, testbed: VirtualTestbed, sensor: LandmarkSensor) -> Self:
+        arrivals = {name: _ARRIVAL.format(signal=name) for name in sensor.signals}
+        samples = {name: testbed.reader(f"{arrival}.sample") for name, arrival in arrivals.items()}
+        times = {f"{name}_time": testbed.reader(f"{arrival}.time") for name, arrival in arrivals.items()}
+        return cls(sensor, samples | times)
+
+    def time(self, context: Context) -> float:
+        return float(self.inputs[f"{self.sensor.signals[-1]}_time"](context))
+
+    def sighting(self, context: Context, history: Array) -> Sighting:
+        inputs = {
+            name: np.atleast_1d(read(context)) if "_time" in name else read(context)
+            for name, read in self.inputs.items()
+        }
+        return self.sensor.sighting(inputs, history)
+
+
+def _due(periods: Sequence[float]) -> Iterator[tuple[float, list[int]]]:
+    """Yield the times at which sensors with these periods have new samples, and the numbers of these sensors."""
+    counts = np.ones(len(periods))
+    while True:
+        times = counts * periods
+        shown = np.flatnonzero(times < times.min() + 1e-6)
+        yield float(times.min()), shown.tolist()
+        counts[shown] += 1.0
 
 
 @dataclass(frozen=True)

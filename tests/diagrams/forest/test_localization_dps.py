@@ -194,7 +194,7 @@ def anything() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("kind", [ForestScenario, PlainScenario])
 def test_arbitrary_scans_give_no_pose_and_no_error(kind: type[CarrierScenario]) -> None:
     scenario = kind(**SMALL, map="poor")
-    localizer = Localizer(scenario.detector(), scenario.unit(scenario.global_map()))
+    localizer = Localizer(scenario.sensors(), scenario.unit(scenario.global_map()))
     reckoning = DeadReckoning(period=PERIOD)
     history = reckoning.GetOutputPort("history").Eval(reckoning.CreateDefaultContext())
     for name, points in anything().items():

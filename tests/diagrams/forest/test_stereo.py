@@ -11,7 +11,7 @@ from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse, wrap
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
-from vtbdrake_diagrams.forest.perception import SHOWN, Localizer
+from vtbdrake_diagrams.forest.perception import SHOWN, LandmarkSensor, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig
 from vtbdrake_diagrams.forest.studies.stereo_trials import errors
@@ -75,7 +75,7 @@ def test_images_of_different_times_are_not_compared() -> None:
         return Landmarks.empty()
 
     unit = SCENARIO.unit(SCENARIO.global_map())
-    localizer = Localizer(see, unit, IMAGES)
+    localizer = Localizer((LandmarkSensor(see, IMAGES),), unit)
     history = np.zeros((3, 6))
     history[:, 0] = [2.0, 1.0, 0.0]
     for left_time, right_time in ((1.0, 1.5), (1.5, 1.5)):
@@ -109,7 +109,7 @@ def test_trials_count_errors_in_pixels() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"perception": "sonar"}, "perception must be one of scanner, stereo, not 'sonar'"),
+        ({"perception": "sonar"}, "perception must be one of scanner, stereo, both, not 'sonar'"),
         ({"stereo": StereoConfig(baseline=0.0)}, "baseline must be a finite number above 0 m"),
         ({"stereo": StereoConfig(largest_disparity=20)}, "multiple of 16 pixels, not 20"),
         ({"stereo": StereoConfig(fps=0.0)}, "stereo.fps must be a finite number above 0 Hz"),

@@ -30,13 +30,16 @@ from scipy.linalg import solve_triangular
 
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
-from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.track_state import TrackState
+from vtbdrake.components.localization.landmarks import Sighting
+from vtbdrake.components.localization.track_state import TrackState, in_level_frame
 
 # A scan fails if it matches a smaller share of its detections.
 _LEAST_SHARE = 0.15
 # A scan fails if it matches a smaller share of the landmarks that should be seen again.
 _LEAST_AGAIN = 0.25
+
+# Near the largest distance of detections, landmarks are not seen reliably: this share of it counts.
+_RELIABLE = 0.7
 
 # The least number of detections, or of landmarks that should be seen again, for this test, in one scan or several.
 _JUDGED_FROM = 6
@@ -66,24 +69,22 @@ _TANGLED = 10.0
 _CHANCE = 0.2
 
 
-def judged(state: TrackState, detections: Landmarks, pairs: Indices) -> tuple[bool, Array]:
+def judged(state: TrackState, sighting: Sighting, pairs: Indices) -> tuple[bool, Array]:
     """Return whether a scan with these pairs of detection and landmark, (k, 2), fails, and what is still to be judged.
 
     Args:
         state: The state before the scan.
-        detections: The detections of the scan, in H.
+        sighting: The detections of the scan, in H.
         pairs: Indices of the detection and of the landmark on the map.
 
     Returns:
         Whether it fails, and the counts for `TrackState.unjudged`, shape (2, 2).
     """
     matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
-    recent = state.landmark_positions[state.is_recent]
-    # Near the largest distance of detections, landmarks are not seen reliably.
-    reach = 0.7 * np.hypot(*detections.positions.T).max()
-    expected = int((np.hypot(*(recent - state.mean[:2]).T) < reach).sum())
+    recent = in_level_frame(state, state.landmark_positions[state.is_recent])
+    expected = int(sighting.is_in_view(recent, share=_RELIABLE).sum())
     fails, unjudged = False, np.zeros((2, 2))
-    scan = np.array([[len(detections), matched], [expected, again]], dtype=float)
+    scan = np.array([[len(sighting.landmarks), matched], [expected, again]], dtype=float)
     for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN)):
         # A scan with many is judged alone: those before it show another place.
         count, matches = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]

@@ -91,7 +91,6 @@ class Association:
         landmarks: The map, in W.
         usable: Indices of the landmarks that may be matched, (n,).
         variances: Variances of the expected detections of these in m², (n,), without the pose's variance.
-        field_of_view: The horizontal field of view in rad, for the density of detections.
         gate: The share of right pairs that the gate lets pass.
         first_gate: The same of first matches.
     """
@@ -99,7 +98,6 @@ class Association:
     landmarks: Landmarks
     usable: Indices
     variances: Array
-    field_of_view: float
     gate: float
     first_gate: float
     _tree: cKDTree = field(init=False, repr=False)
@@ -126,12 +124,13 @@ class Association:
         squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
         return self.usable[np.unique(near[squares <= gate * (spread[rows] + self.variances[near])])]
 
-    def matched(self, detections: Landmarks, expected: ExpectedDetections) -> MatchedPairs:
+    def matched(self, detections: Landmarks, expected: ExpectedDetections, *, field_of_view: float) -> MatchedPairs:
         """Return the matches of detections, in H with their noise, with those that are expected.
 
         Args:
             detections: The detections of the scan, in H.
             expected: The detections that are expected of landmarks nearby.
+            field_of_view: The horizontal field of view of the sensor in rad, for the density of detections.
         """
         m = np.arange(len(expected.indices))
         innovations = detections.positions[:, None] - expected.positions
@@ -149,7 +148,7 @@ class Association:
         rows, columns = one_to_one(gain)
         density = np.zeros(squares.shape)
         density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
-        area = 0.5 * self.field_of_view * max(1.0, float((detections.positions**2).sum(axis=1).max()))
+        area = 0.5 * field_of_view * max(1.0, float((detections.positions**2).sum(axis=1).max()))
         unmapped = _UNMAPPED_ODDS * len(detections) / area
         rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
         probability = (density / (unmapped + rivals))[rows, columns]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from math import inf
+from math import inf, pi
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.components.localization.planar import rotation, transform
@@ -86,6 +86,50 @@ class Landmarks:
             self.diameters,
             self.diameter_deviations,
         )
+
+
+@immutable
+class Sighting:
+    """The landmarks that one of several sensors detects at one time, and where it looks.
+
+    Attributes:
+        landmarks: The detections, in the level frame H of the carrier, with the covariances of this sensor.
+        field_of_view: Its horizontal field of view about x of H, in rad, at most 2 pi.
+        is_scan: Whether the ranges have the bias that a `Tracker` estimates. The errors of a sensor of another kind,
+            such as a pair of cameras beside a scanner, are all in its covariances.
+
+    Raises:
+        ValueError: The field of view is outside of its range.
+    """
+
+    landmarks: Landmarks
+    field_of_view: float = 2.0 * pi
+    is_scan: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.field_of_view <= 2.0 * pi:
+            raise ValueError(f"a field of view is above 0 and at most 2 pi rad, not {self.field_of_view!r}")
+
+    @classmethod
+    def of(cls, seen: Landmarks | Sighting) -> Sighting:
+        """Return a sighting as it is, and landmarks as those of a scanner that sees all around."""
+        return seen if isinstance(seen, Sighting) else cls(seen)
+
+    def is_in_view(self, positions: ArrayLike, *, share: float) -> NDArray[np.bool_]:
+        """Return which places are in view, shape (n,): within a share of the largest distance of detections.
+
+        Args:
+            positions: The places in H, shape (n, 2).
+            share: Share of that distance, as landmarks near it are not seen reliably.
+        """
+        places = np.asarray(positions, dtype=float).reshape(-1, 2)
+        if not len(self.landmarks):
+            return np.zeros(len(places), dtype=bool)
+        reach = share * np.hypot(*self.landmarks.positions.T).max()
+        is_near = np.hypot(*places.T) < reach
+        is_ahead = 2.0 * np.abs(np.arctan2(places[:, 1], places[:, 0])) <= self.field_of_view
+        is_in_view: NDArray[np.bool_] = is_near & is_ahead
+        return is_in_view
 
 
 def map_landmarks(model: WorldModel, kind: str = "tree", *, deviation: float = 0.0) -> Landmarks:

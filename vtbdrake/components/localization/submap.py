@@ -15,8 +15,8 @@ from vtbdrake.components.estimation import (
     squared_distances,
     weighted_mean,
 )
-from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import inverse, rotation
+from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.planar import inverse, rotation, transform
 
 # The share of right pairs that the gate of the association lets pass.
 _GATE = 0.997
@@ -86,14 +86,16 @@ class Submap:
         grown = self.covariances + J @ C_O @ J.transpose(0, 2, 1)
         return replace(self, X_OH=pose, distance=distance, covariances=grown)._select(distance - self.last <= length)
 
-    def with_scan(self, landmarks: Landmarks, *, least_deviation: float) -> Submap:
+    def with_scan(self, seen: Landmarks | Sighting, *, least_deviation: float) -> Submap:
         """Return the map after a scan at its pose: detections are merged with landmarks that it has, or added.
 
         Args:
-            landmarks: The detections, in H.
+            seen: The detections, in H.
             least_deviation: Standard deviation in m that is added to the deviations of positions, see
                 `ConstellationMap`.
         """
+        sighting = Sighting.of(seen)
+        landmarks = sighting.landmarks
         if not len(landmarks):
             return self
         scan = landmarks.seen_from(self.X_OH)
@@ -112,7 +114,7 @@ class Submap:
         hits, last = self.seen.copy(), self.last.copy()
         hits[old] += 1.0
         last[old] = self.distance
-        in_view = np.hypot(*(positions - self.X_OH[:2]).T) < _IN_VIEW * np.hypot(*landmarks.positions.T).max()
+        in_view = sighting.is_in_view(transform(inverse(self.X_OH), positions), share=_IN_VIEW)
         in_view[old] = True
         rest = np.setdiff1d(np.arange(len(landmarks)), new)
         once = np.ones(len(rest))

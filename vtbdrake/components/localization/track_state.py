@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array, Indices, immutable
+from vtbdrake.components.localization.planar import rotation
 
 BIAS = 3
 """The place of b in x."""
@@ -31,7 +32,7 @@ class TrackState:
         mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
         covariance: The covariance of x, shape (6 + 2 n, 6 + 2 n).
         indices: Indices on the map of the landmarks in x, shape (n,).
-        is_recent: Whether each of them was seen in the last scan that was fused, shape (n,).
+        is_recent: Whether each of them was seen in the last scan that was fused and had it in view, shape (n,).
         evidence: Cumulative log-likelihood ratio of first matches.
         failures: The number of scans in succession that failed.
         distortion: The test statistic of a distorted map after the last scan that was fused.
@@ -99,3 +100,8 @@ class TrackState:
             indices=self.indices[~mask],
             is_recent=self.is_recent[~mask],
         )
+
+
+def in_level_frame(state: TrackState, places: Array) -> Array:
+    """Return places (n, 2) in W as they are in the level frame H of the carrier at the estimated pose, (n, 2)."""
+    return (places - state.mean[:2]) @ rotation(-state.mean[2]).T

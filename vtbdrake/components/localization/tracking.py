@@ -8,7 +8,7 @@ each scan would become overconfident, because it is the same error. A detection 
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
-where s is the position of the scanner. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous
+where s is the position of the scanner; for a sensor of another kind beside it (`Sighting.is_scan`), b is 0. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous
 localization and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
 
 The heading of a plain extended Kalman filter becomes overconfident. Scans show the positions of landmarks relative to
@@ -40,7 +40,7 @@ like its neighbours.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import pi
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,9 +51,9 @@ from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization import health
 from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
-from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.landmarks import Landmarks, Sighting
 from vtbdrake.components.localization.planar import compose, rotation
-from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState
+from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState, in_level_frame
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
 _OBSERVED = 4
@@ -107,7 +107,11 @@ class Tracker:
         (0.0, 0.0), "The position s = p_HoLo_H of the scanner in the plane.", unit="m"
     )
     field_of_view: float = setting(
-        2.0 * pi, "The horizontal field of view, for the density of detections.", unit="rad", gt=0.0, le=2.0 * pi
+        2.0 * pi,
+        "The horizontal field of view, for the density of detections; a `Sighting` may have a narrower one.",
+        unit="rad",
+        gt=0.0,
+        le=2.0 * pi,
     )
     bias_deviation: float = setting(0.03, "Standard deviation of the range bias; assumed.", unit="m", ge=0.0)
     odometry_deviation: float = setting(0.02, "Standard deviation of e; assumed.", ge=0.0)
@@ -184,30 +188,30 @@ class Tracker:
             )
         # Variances of an expected detection without the pose's: of the landmark, of the bias and of the scan.
         spread = variances[usable].astype(float) + self.bias_deviation**2 + self.scan_deviation**2
-        association = Association(self.landmarks, usable, spread, self.field_of_view, self.gate, self.first_gate)
+        association = Association(self.landmarks, usable, spread, self.gate, self.first_gate)
         object.__setattr__(self, "_association", association)
 
     def start(
-        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | None = None
+        self, X_WH: ArrayLike, covariance: ArrayLike, seen: Landmarks | Sighting | None = None
     ) -> tuple[TrackState, Matches]:
         """Return the state at a first pose, and the matches of what is seen there.
 
-        With landmarks, the pose is assumed to come from the same map, whose errors must not be used twice: the
+        With detections, the pose is assumed to come from the same map, whose errors must not be used twice: the
         covariance serves for the association only, and the estimate is computed from the matched pairs alone.
 
         Args:
             X_WH: The pose, shape (3,).
             covariance: The covariance of the pose, shape (3, 3).
-            landmarks: Detections in H at that pose; None starts with the given covariance.
+            seen: Detections in H at that pose; None starts with the given covariance.
         """
         pose = np.array(X_WH, dtype=float)
         state = self._at(pose, np.array(covariance, dtype=float))
-        if landmarks is None:
+        if seen is None:
             return state, _NO_MATCHES
-        detections = landmarks.widened(self.least_deviation)
-        matches = self._associate(state, detections).first(self.most)
+        sighting = self._widened(seen)
+        matches = self._associate(state, sighting).first(self.most)
         loose = self._at(pose, np.diag(_LOOSE**2))
-        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), detections, matches.pairs)
+        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), sighting, matches.pairs)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, extent: float) -> TrackState:
         """Return the state after a motion.
@@ -240,23 +244,23 @@ class Tracker:
         P[ODOMETRY, ODOMETRY] += (1.0 - decay**2) * self.odometry_deviation**2
         return state.with_arrays(mean=mean, covariance=P)
 
-    def update(self, state: TrackState, landmarks: Landmarks) -> tuple[TrackState, Matches]:
+    def update(self, state: TrackState, seen: Landmarks | Sighting) -> tuple[TrackState, Matches]:
         """Return the state after a scan, and its matches.
 
         Args:
             state: The state at the time of the scan.
-            landmarks: The detections, in H.
+            seen: The detections, in H.
         """
-        if not len(landmarks):
+        sighting = self._widened(seen)
+        if not len(sighting.landmarks):
             return state, _NO_MATCHES
-        detections = landmarks.widened(self.least_deviation)
-        matches = self._associate(state, detections)
+        matches = self._associate(state, sighting)
         failed = replace(
             state.with_arrays(unjudged=np.zeros((2, 2))),
             failures=state.failures + 1,
             drift=health.drift_after_failure(state),
         )
-        fails, unjudged = health.judged(state, detections, matches.pairs)
+        fails, unjudged = health.judged(state, sighting, matches.pairs)
         if fails:
             return failed, Matches(matches.pairs)
         if len(matches.pairs) < 2:
@@ -264,9 +268,9 @@ class Tracker:
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
-        fused, remaining = self._fused(extended, detections, np.vstack([matches.pairs[~is_first], first.pairs]))
+        fused, remaining = self._fused(extended, sighting, np.vstack([matches.pairs[~is_first], first.pairs]))
         # Too few of the pairs may be left.
-        fails, unjudged = health.judged(state, detections, remaining.pairs)
+        fails, unjudged = health.judged(state, sighting, remaining.pairs)
         if fails:
             return failed, Matches(remaining.pairs)
         evidence = min(self.credit, state.evidence + health.evidence(first.squares, self.first_gate))
@@ -290,6 +294,10 @@ class Tracker:
     def pose_covariance(self, state: TrackState) -> Array:
         """Return the covariance of X_WH, (3, 3), larger than the filter's if the map seems distorted."""
         return state.pose_covariance * health.widening(state)
+
+    def _widened(self, seen: Landmarks | Sighting) -> Sighting:
+        sighting = Sighting.of(seen)
+        return replace(sighting, landmarks=sighting.landmarks.widened(self.least_deviation))
 
     def _at(self, X_WH: Array, covariance: Array) -> TrackState:
         P = block_diag(covariance, self.bias_deviation**2, self.odometry_deviation**2, self.rate_deviation**2)
@@ -340,26 +348,30 @@ class Tracker:
         M[np.diag_indices_from(M)] = variances
         return M
 
-    def _associate(self, state: TrackState, detections: Landmarks) -> MatchedPairs:
+    def _associate(self, state: TrackState, sighting: Sighting) -> MatchedPairs:
         """Return the matches of detections with the map around the pose of a state."""
+        detections = sighting.landmarks
         near = self._association.nearby(state.pose, state.pose_covariance, detections)
         if not len(near):
             return MatchedPairs.none()
         extended = self._extended(state, near[~np.isin(near, state.indices)])
         rows = np.flatnonzero(np.isin(extended.indices, near))
-        positions, H = self._expected(extended, rows)
+        positions, H = self._expected(extended, rows, is_scan=sighting.is_scan)
         HPHt = _times(H, rows, _times_transpose(extended.covariance, H, rows))
         covariance = HPHt.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
         is_first = rows >= len(state.indices)
         expected = ExpectedDetections(extended.indices[rows], is_first, positions, covariance)
-        return self._association.matched(detections, expected)
+        return self._association.matched(
+            detections, expected, field_of_view=min(self.field_of_view, sighting.field_of_view)
+        )
 
-    def _fused(self, state: TrackState, detections: Landmarks, pairs: Indices) -> tuple[TrackState, Matches]:
+    def _fused(self, state: TrackState, sighting: Sighting, pairs: Indices) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
+        detections = sighting.landmarks
         # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
         while len(pairs):
             rows = _rows_of(state.indices, pairs[:, 1])
-            expected, H = self._expected(state, rows)
+            expected, H = self._expected(state, rows, is_scan=sighting.is_scan)
             nu = (detections.positions[pairs[:, 0]] - expected).ravel()
             PHt = _times_transpose(state.covariance, H, rows)
             S = _times(H, rows, PHt) + block_diag(*detections.covariances[pairs[:, 0]])
@@ -375,7 +387,9 @@ class Tracker:
         K = cho_solve(factor, PHt.T).T
         P = state.covariance - PHt @ K.T
         mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
-        fused = state.with_arrays(mean=mean, covariance=P, is_recent=np.isin(state.indices, pairs[:, 1]))
+        is_in_view = sighting.is_in_view(in_level_frame(state, state.landmark_positions), share=inf)
+        is_recent = np.where(is_in_view, np.isin(state.indices, pairs[:, 1]), state.is_recent)
+        fused = state.with_arrays(mean=mean, covariance=P, is_recent=is_recent)
         distance = np.hypot(*(fused.landmark_positions - mean[:2]).T)
         far = distance > self.horizon
         far[np.argsort(distance)[self.most :]] = True
@@ -384,17 +398,17 @@ class Tracker:
         distortion = health.distortion(places, near.landmark_positions - places, self._map_errors(near.indices))
         return replace(near, distortion=distortion), Matches(pairs, float(parts.sum()), is_fused=True)
 
-    def _expected(self, state: TrackState, rows: Indices) -> tuple[Array, Array]:
+    def _expected(self, state: TrackState, rows: Indices, *, is_scan: bool) -> tuple[Array, Array]:
         """Return the expected detections of landmarks of the state in H, (m, 2), and the derivatives (m, 2, 6).
 
         The derivatives are those with respect to the pose, the bias, and the landmark itself.
         """
         R_HW = rotation(-state.mean[2])
-        d = (state.landmark_positions[rows] - state.mean[:2]) @ R_HW.T
+        d = in_level_frame(state, state.landmark_positions[rows])
         ray = d - np.asarray(self.sensor)
         length = np.maximum(np.hypot(*ray.T), 1e-3)[:, None]
         along = ray / length
-        bias = state.mean[BIAS]
+        bias = state.mean[BIAS] if is_scan else 0.0
         # The derivative of d + b along, with respect to d.
         across = np.eye(2) - along[:, :, None] * along[:, None, :]
         D = np.eye(2) + (bias / length)[:, :, None] * across
@@ -402,7 +416,7 @@ class Tracker:
         H[:, :, 4:] = D @ R_HW
         H[:, :, :2] = -H[:, :, 4:]
         H[:, :, 2] = np.einsum("nij,nj->ni", D, d[:, ::-1] * [1.0, -1.0])
-        H[:, :, 3] = along
+        H[:, :, 3] = along if is_scan else 0.0
         return d + bias * along, H
 
 

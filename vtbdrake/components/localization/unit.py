@@ -7,7 +7,7 @@ was in doubt.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite, nan
 
@@ -18,7 +18,7 @@ from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
-from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.landmarks import Landmarks, Sighting
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.components.localization.track_state import TrackState
@@ -41,6 +41,9 @@ _LARGEST = 1e9
 
 # The fewest matched detections with which a track begins.
 _FEWEST = 4
+
+Seen = Landmarks | Sequence[Sighting]
+"""Detections of one time in H: a scanner's landmarks, or sightings of several sensors, each with its covariances."""
 
 
 @immutable
@@ -150,17 +153,17 @@ class LocalizationUnit:
         """Return the memory before the first scan."""
         return UnitState()
 
-    def step(
-        self, state: UnitState, landmarks: Landmarks, *, X_OH: ArrayLike, time: float
-    ) -> tuple[Localization, UnitState]:
-        """Return the answer to a scan, and the memory after it.
+    def step(self, state: UnitState, seen: Seen, *, X_OH: ArrayLike, time: float) -> tuple[Localization, UnitState]:
+        """Return the answer to a scan, or to what several sensors see at one time, and the memory after it.
+
+        The filter is one for all sensors: their sightings are fused one after the other.
 
         A call with a pose or a time that is not finite, a pose of 1e9 m or more, or a time that is not after the last
         one, is ignored and counted. It returns the last answer, with the time of that answer.
 
         Args:
             state: The memory before.
-            landmarks: The detected landmarks, in H.
+            seen: The detections.
             X_OH: The pose of the carrier by odometry at the time of the scan, shape (3,).
             time: The time of the scan, in s.
 
@@ -170,6 +173,7 @@ class LocalizationUnit:
         pose = np.asarray(X_OH, dtype=float)
         if pose.shape != (3,):
             raise ValueError(f"X_OH is a planar pose [x, y, heading], shape (3,), not of shape {pose.shape}")
+        sightings = [Sighting(seen)] if isinstance(seen, Landmarks) else list(seen)
         last = state.answer
         if not ((np.abs(pose) < _LARGEST).all() and isfinite(time) and time > last.time):
             return last, replace(state, ignored=state.ignored + 1)
@@ -181,56 +185,69 @@ class LocalizationUnit:
             state = replace(state, submap=Submap.empty(pose))
         if state.track.is_tracking:
             extent = self.drift.extent(motion, duration)
-            predicted = self.tracker.predict(state.track, motion, C, extent=extent)
-            track, matches = self.tracker.update(predicted, landmarks)
+            track = self.tracker.predict(state.track, motion, C, extent=extent)
+            fused = []
+            for sighting in sightings:
+                track, matches = self.tracker.update(track, sighting)
+                fused.append(matches)
             is_doubtful = self.tracker.is_doubtful(track)
             doubted = state.doubted + float(np.hypot(*motion[:2])) if is_doubtful else 0.0
             if self.tracker.is_lost(track) or doubted > self.doubt_length:
                 # What was seen in doubt is of the same place.
-                lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
-                submap = self._gathered(state.submap, landmarks, pose, C)
+                lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=_count(sightings))
+                submap = self._gathered(state.submap, sightings, pose, C)
                 return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
             if is_doubtful:
-                answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
-                submap = self._gathered(state.submap, landmarks, pose, C)
+                answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=_count(sightings))
+                submap = self._gathered(state.submap, sightings, pose, C)
             else:
-                answer = self._answer(track, matches, len(landmarks), pose, time)
+                answer = self._answer(track, fused, _count(sightings), pose, time)
                 submap = Submap.empty(pose)
             return answer, replace(state, answer=answer, track=track, submap=submap, doubted=doubted)
-        return self._searched(state, landmarks, pose, C, time)
+        return self._searched(state, sightings, pose, C, time)
 
     def _searched(
-        self, state: UnitState, landmarks: Landmarks, X_OH: Array, C: Array, time: float
+        self, state: UnitState, sightings: Sequence[Sighting], X_OH: Array, C: Array, time: float
     ) -> tuple[Localization, UnitState]:
         """Return the answer and the memory after a scan that follows an answer without a pose."""
-        submap = self._gathered(state.submap, landmarks, X_OH, C)
-        none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
+        submap = self._gathered(state.submap, sightings, X_OH, C)
+        none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=_count(sightings))
         state = replace(state, answer=none, submap=submap)
         gathered = submap.landmarks()
-        if not len(gathered) or not (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any():
+        is_due = (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any()
+        if len(gathered) < self.locator.fewest or not is_due:
             return none, state
         state = replace(state, tried_at=np.array([submap.distance, time]))
         fix = self.locator.locate(gathered)
         if not fix.is_sure:
             return none, state
-        detections = gathered if self.begins_with_submap else landmarks
-        track, matches = self.tracker.start(fix.pose, fix.covariance, detections)
+        # The sensor that sees most begins the track.
+        most = max(sightings, key=lambda sighting: len(sighting.landmarks), default=Sighting(Landmarks.empty()))
+        track, matches = self.tracker.start(fix.pose, fix.covariance, gathered if self.begins_with_submap else most)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
-        answer = self._answer(track, matches, len(landmarks), X_OH, time)
+        answer = self._answer(track, [matches], _count(sightings), X_OH, time)
         return answer, UnitState(answer, track, Submap.empty(X_OH), ignored=state.ignored, losses=state.losses)
 
-    def _gathered(self, submap: Submap, landmarks: Landmarks, X_OH: Array, C: Array) -> Submap:
-        """Return the submap after a motion with covariance C and a scan."""
-        moved = submap.moved(X_OH, C, length=self.submap_length)
-        return moved.with_scan(landmarks, least_deviation=self.locator.least_deviation)
+    def _gathered(self, submap: Submap, sightings: Sequence[Sighting], X_OH: Array, C: Array) -> Submap:
+        """Return the submap after a motion with covariance C and what is seen then."""
+        gathered = submap.moved(X_OH, C, length=self.submap_length)
+        for sighting in sightings:
+            gathered = gathered.with_scan(sighting, least_deviation=self.locator.least_deviation)
+        return gathered
 
-    def _answer(self, track: TrackState, matches: Matches, detected: int, X_OH: Array, time: float) -> Localization:
+    def _answer(
+        self, track: TrackState, fused: Sequence[Matches], detected: int, X_OH: Array, time: float
+    ) -> Localization:
         covariance = self.tracker.pose_covariance(track)
-        matched = len(matches.pairs) if matches.is_fused else 0
-        return Localization(
-            time, X_OH, track.pose, covariance, TRACKING, detected, matched, matches.nis, track.range_bias
-        )
+        matched = sum(len(matches.pairs) for matches in fused if matches.is_fused)
+        nis = sum(matches.nis for matches in fused)
+        return Localization(time, X_OH, track.pose, covariance, TRACKING, detected, matched, nis, track.range_bias)
+
+
+def _count(sightings: Sequence[Sighting]) -> int:
+    """Return the number of detections."""
+    return sum(len(sighting.landmarks) for sighting in sightings)
 
 
 _CODEC = codec_of(UnitState())
