@@ -73,9 +73,7 @@ def _imports() -> np.ndarray:
 
 
 def _ladder_text(totals: np.ndarray, unit: str) -> str:
-    return "; with " + ", then ".join(
-        f"{name} {total:.3g} {unit}" for name, total in zip(IMPORTS, totals, strict=True)
-    )
+    return "; with " + ", then ".join(f"{name} {total:.3g} {unit}" for name, total in zip(IMPORTS, totals, strict=True))
 
 
 def _row(name: str, unit: str, alone: np.ndarray, whole: np.ndarray, note: str = "") -> Benchmark:

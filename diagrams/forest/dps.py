@@ -25,24 +25,24 @@ AXLE = -0.8
 """The x coordinate in B of the rear axle, which is not steered, in m."""
 
 
-def make_deployment(maps: Mapping[LcmMap, float]) -> Deployment:
+def make_deployment(*maps: tuple[LcmMap, float]) -> Deployment:
     """Return the deployment of the localization unit on its carrier: after a fault, the advised route stays.
 
     Signals of numbers are sent as ``lcmt_scope``; scans or images are sent before them in the cycle of the carrier.
 
     Args:
-        maps: The maps of the messages of scans and images, with the time from one to the next in s.
+        *maps: The maps of the messages of scans and images, each with the time from one to the next in s.
     """
     return Deployment(
         protocol=Protocol(
             sense=[
-                *maps,
+                *(each for each, _ in maps),
                 vector_map("ODOMETRY", lcmt_scope, {"odometry": "value"}),
                 vector_map("IMU", lcmt_scope, {"imu": "value"}),
             ],
             act=[vector_map("ROUTE_COMMAND", lcmt_scope, {"route": "value"})],
             commands=[vector_map("ROUTE", lcmt_scope, {"route": "value"})],
-            periods={each.channel: period for each, period in maps.items()},
+            periods={each.channel: period for each, period in maps},
         ),
         period=PERIOD,
         guards={"fallback": {"route": Hold()}},

@@ -263,7 +263,7 @@ class CarrierScenario(Scenario):
         return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
-        return make_deployment({scan_map("SCAN", "scan"): 1.0 / self.scanner.frequency})
+        return make_deployment((scan_map("SCAN", "scan"), 1.0 / self.scanner.frequency))
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
@@ -439,12 +439,12 @@ class ForestScenario(CarrierScenario):
         return replace(unit, tracker=tracker, begins_with_submap=True)
 
     def deployment(self) -> Deployment:
-        maps: dict[LcmMap, float] = {}
+        maps: list[tuple[LcmMap, float]] = []
         if self.has_scanner:
-            maps[scan_map("SCAN", "scan")] = 1.0 / self.scanner.frequency
+            maps.append((scan_map("SCAN", "scan"), 1.0 / self.scanner.frequency))
         if self.has_stereo:
-            maps[image_array_map("IMAGES", {name: name for name in IMAGES})] = 1.0 / self.stereo.fps
-        return make_deployment(maps)
+            maps.append((image_array_map("IMAGES", {name: name for name in IMAGES}), 1.0 / self.stereo.fps))
+        return make_deployment(*maps)
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         if self.has_scanner:

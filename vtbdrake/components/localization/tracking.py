@@ -8,8 +8,9 @@ each scan would become overconfident, because it is the same error. A detection 
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
-where s is the position of the scanner; for a sensor of another kind beside it (`Sighting.is_scan`), b is 0. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous
-localization and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
+where s is the position of the scanner; for a sensor of another kind beside it (`Sighting.is_scan`), b is 0. This is
+EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous localization and mapping: part I", IEEE Robotics &
+Automation Magazine 13, 2006). Landmarks far behind are marginalized.
 
 The heading of a plain extended Kalman filter becomes overconfident. Scans show the positions of landmarks relative to
 the carrier, so that a common rotation of both is not observable; but with derivatives at estimates that change from

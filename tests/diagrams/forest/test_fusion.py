@@ -1,0 +1,130 @@
+"""A localization unit with a scanner and a pair of cameras."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.unit import TRACKING
+from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stereo import IMAGES
+from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.fusion import CONDITIONS, SHORT, Fusion, middle, report, seen_by
+
+pytestmark = pytest.mark.one_python
+
+SCENARIO = ForestScenario(seed=1, perception="both", length=60.0, width=60.0, start=12.0)
+
+
+def at(distances: list[float]) -> Landmarks:
+    """Return landmarks straight ahead."""
+    n = len(distances)
+    places = np.column_stack([distances, np.zeros(n)])
+    return Landmarks(places, np.tile(0.01 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.1))
+
+
+def test_samples_are_fused_once_in_the_order_of_their_times() -> None:
+    taken = []
+
+    def scanned(scan: int, history: np.ndarray, time: float) -> Landmarks:
+        taken.append(("scan", scan, time))
+        return at([4.0, 5.0])
+
+    def pictured(left: int, right: int, history: np.ndarray, time: float) -> Landmarks:
+        taken.append(("images", left, time))
+        return at([4.0])
+
+    unit = SCENARIO.unit(SCENARIO.global_map())
+    cameras = LandmarkSensor(pictured, IMAGES, field_of_view=1.3, is_scan=False)
+    localizer = Localizer((LandmarkSensor(scanned), cameras), unit)
+    history = np.zeros((3, 6))
+    history[:, 0] = [4.0, 2.0, 0.0]
+
+    def call(memory: Any, *, scan: float, images: float) -> tuple[dict[str, Any], Any]:
+        times = {"scan_time": scan, **{f"{name}_time": images for name in IMAGES}}
+        inputs = {name: np.array([time]) for name, time in times.items()}
+        return localizer(
+            request=np.ones(1), history=history.ravel(), memory=memory, scan=1, left_image=2, right_image=3, **inputs
+        )
+
+    outputs, memory = call(unit.start(), scan=1.0, images=1.0)
+    assert outputs["time"] == [1.0] and outputs["detected"] == [3]
+    outputs, memory = call(memory, scan=1.2, images=1.0)
+    assert outputs["time"] == [1.2] and outputs["detected"] == [2]
+    # The images arrived before the next scan, while the localizer was busy.
+    outputs, memory = call(memory, scan=1.6, images=1.5)
+    assert outputs["time"] == [1.6] and memory.ignored == 0
+    assert taken == [
+        ("scan", 1, 1.0),
+        ("images", 2, 1.0),
+        ("scan", 1, 1.2),
+        ("images", 2, 1.5),
+        ("scan", 1, 1.6),
+    ]
+    assert call(memory, scan=1.6, images=1.5)[1].ignored == 1
+
+
+def test_conditions_take_away_what_they_say() -> None:
+    times = STANDING + np.array([1.0, 2.0, 3.0, 4.0])
+    pose = np.zeros((4, 3))
+    sightings = [Sighting(at([4.0, SHORT + 1.0])), Sighting(at([15.0]), 1.3, is_scan=False)]
+    drive = Drive(times, pose, pose, (sightings[:1], sightings[1:], sightings, sightings[:1]))
+    assert middle(drive) == STANDING + 2.0
+
+    def counts(sensors: str, condition: str) -> list[list[int]]:
+        return [[len(each.landmarks) for each in at_time] for at_time in seen_by(drive, sensors, condition).landmarks]
+
+    usual, short, silent = CONDITIONS
+    assert counts("both", usual) == [[2], [1], [2, 1], [2]]
+    assert counts("scanner", usual) == [[2], [], [2], [2]]
+    assert counts("cameras", usual) == [[], [1], [1], []]
+    assert counts("both", short) == [[1], [1], [1, 1], [1]]
+    assert counts("both", silent) == [[2], [1], [1], []]
+    assert [each.is_scan for at_time in seen_by(drive, "cameras", usual).landmarks for each in at_time] == [True, True]
+    assert [each.is_scan for each in seen_by(drive, "both", usual).landmarks[2]] == [True, False]
+
+
+def test_report_counts_forests_in_which_both_are_better() -> None:
+    def errors(scanner: float, cameras: float, both: float) -> Fusion:
+        keys = [(condition, name) for condition in CONDITIONS for name in ("accurate", "remote")]
+        values = {"scanner": scanner, "cameras": cameras, "both": both}
+        squares = {(*key, one): (4.0 * error**2, 4) for key in keys for one, error in values.items()}
+        return Fusion(squares, dict.fromkeys(CONDITIONS, 8), dict.fromkeys(squares, 0))
+
+    text = report([errors(0.1, 0.3, 0.09), errors(0.1, 0.05, 0.06)])
+    first = text.splitlines()[2]
+    assert "0.100 m in 50%" in first and "0.215 m in 50%" in first and "0.076 m in 50%" in first
+    assert first.rstrip().endswith("1 of 2")
+
+
+def test_unit_has_a_message_for_each_sensor() -> None:
+    interface = SCENARIO.interface()
+    assert [signal.name for signal in interface.sense] == ["scan", *IMAGES, "imu", "odometry"]
+    periods = SCENARIO.deployment().protocol.periods
+    assert periods["SCAN"] == pytest.approx(0.2) and periods["IMAGES"] == pytest.approx(0.5)
+    dps = DpsAlone(SCENARIO)
+    assert {"left_image", "right_image", "scan"} <= {signal.name for signal in dps.interface.sense}
+
+
+@pytest.mark.slow
+def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
+    drive = recorded_drive(SCENARIO, length=1.5)
+    kinds = [[each.is_scan for each in sightings] for sightings in drive.landmarks]
+    assert kinds[:6] == [[True], [True], [False], [True], [True], [True, False]]
+    found = localize(drive, SCENARIO.unit(SCENARIO.global_map()))
+    testbed = SCENARIO.build()
+    simulator = testbed.simulator()
+    context = simulator.get_mutable_context()
+    testbed.write(context, {"sim.act.driver.speed": 0.0})
+    simulator.AdvanceTo(STANDING + 0.2)
+    testbed.write(context, {"sim.act.driver.speed": SCENARIO.speed})
+    simulator.AdvanceTo(drive.times[-1] + SCENARIO.localizer_latency + 0.08)
+    assert testbed.read(context, "dps.env.localizer.status") == TRACKING
+    assert testbed.read(context, "dps.env.localizer.time") == pytest.approx(drive.times[-1])
+    np.testing.assert_allclose(testbed.read(context, "dps.env.localizer.pose"), found.poses[-1], atol=1e-9)
+    np.testing.assert_allclose(found.poses[-1], drive.truth[-1], atol=0.2)
