@@ -1,9 +1,10 @@
 """Scanner and cameras of one localization unit, fused in one filter, beside each of them alone on the same drives.
 
-``python -m vtbdrake_diagrams.forest.studies.fusion [--forests N] [--length M]`` drives a carrier with both sensors
-through forests, once each, and localizes it three times from what was recorded: with the scanner, with the cameras,
-with both. Three conditions are made from the same recordings (`CONDITIONS`): the sensors as they are, a scanner that
-sees `SHORT` m far only, as in dust or snow, and a scanner that is silent in the second half of the drive.
+``python -m vtbdrake_diagrams.forest.studies.fusion [--forests N]`` drives a carrier with both sensors through forests,
+once each, and localizes it three times from what was recorded: with the scanner, with the cameras, with both. What is
+in `FILE` is not driven again. Three conditions are made from the same recordings (`CONDITIONS`): the sensors as they
+are, a scanner that sees `SHORT` m far only, as in dust or snow, and a scanner that is silent in the second half of the
+drive.
 
 The criteria, fixed before any of the forests from `SEED` on was driven: the error of the position over all sample times
 of the judged part at which the unit claims a pose (RMS over all forests), the share of these times with a pose, wrong
@@ -12,12 +13,14 @@ claims as `drives` counts them, and the number of forests in which both sensors 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from math import inf, nan
 from multiprocessing import get_context
+from pathlib import Path
 
 import click
 import numpy as np
@@ -28,9 +31,16 @@ from vtbdrake.components.localization.landmarks import Sighting
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS
+from vtbdrake_diagrams.kept_results import read_results, write_results
 
 SEED = 700_000
 """The seed of the first forest."""
+LENGTH = 20.0
+"""The length of a drive in m."""
+FILE = Path(__file__).with_suffix(".json")
+"""The file in which the errors are kept."""
+SILENT = "scanner falls silent"
+"""The condition that is judged from the middle of the drive on."""
 SHORT = 12.0
 """The distance to which a scanner in dust or snow sees trunks, in m."""
 MAP_NAMES = ("accurate", "remote")
@@ -57,7 +67,7 @@ def _silent(sighting: Sighting, time: float, *, middle: float) -> Sighting | Non
 CONDITIONS: Mapping[str, Callable[..., Sighting | None]] = {
     "as it is": _as_it_is,
     f"scanner sees {SHORT:g} m": _short,
-    "scanner falls silent": _silent,
+    SILENT: _silent,
 }
 """The conditions: functions that return what is left of a sighting at a time, with the middle of the drive."""
 
@@ -88,26 +98,31 @@ def middle(drive: Drive) -> float:
 
 
 @dataclass(frozen=True)
-class Fusion:
-    """Errors in one forest.
+class Error:
+    """The errors of the position in one forest, under one condition, with one map and some of the sensors.
 
     Attributes:
-        squares: Sum of the squared errors of the position in m^2 and the number of poses, by (condition, map, sensors).
-        samples: The number of sample times that count, by condition.
-        wrong: The number of wrong claims by (condition, map, sensors).
+        condition, map, sensors: Their names.
+        rms: RMS error of the position in m, None without a pose.
+        poses: The number of sample times with a pose.
+        samples: The number of sample times.
+        wrong: The number of wrong claims.
     """
 
-    squares: Mapping[tuple[str, str, str], tuple[float, int]]
-    samples: Mapping[str, int]
-    wrong: Mapping[tuple[str, str, str], int]
+    condition: str
+    map: str
+    sensors: str
+    rms: float | None
+    poses: int
+    samples: int
+    wrong: int
 
-    def rms(self, key: tuple[str, str, str]) -> float:
-        """Return the RMS error of the position in m; infinite without a pose."""
-        total, count = self.squares[key]
-        return float(np.sqrt(total / count)) if count else np.inf
+
+Forests = Mapping[int, Sequence[Error]]
+"""The errors by the seed of the forest."""
 
 
-def compared(seed: int, *, length: float) -> Fusion:
+def compared(seed: int, *, length: float = LENGTH) -> list[Error]:
     """Return the errors in the forest of a seed.
 
     Args:
@@ -116,70 +131,105 @@ def compared(seed: int, *, length: float) -> Fusion:
     """
     scenario = forest(seed, perception="both")
     with threadpool_limits(1):
-        drive = recorded_drive(scenario, length=length)
-        return judged(drive, scenario)
+        return judged(recorded_drive(scenario, length=length), scenario)
 
 
-def judged(drive: Drive, scenario: ForestScenario) -> Fusion:
+def judged(drive: Drive, scenario: ForestScenario) -> list[Error]:
     """Return the errors of a drive.
 
     Args:
         drive: The drive of a carrier with both sensors.
         scenario: Its scenario.
     """
-    squares, samples, wrong = {}, {}, {}
+    errors = []
     for name, sensors in product(MAP_NAMES, SENSORS):
         of = replace(scenario, perception=SENSORS[sensors], map=name)
         unit = of.unit(of.global_map())
         for condition in CONDITIONS:
-            counts = drive.times > (middle(drive) if condition == "scanner falls silent" else STANDING)
-            samples[condition] = int(counts.sum())
+            counts = drive.times > (middle(drive) if condition == SILENT else STANDING)
             track = localize(seen_by(drive, sensors, condition), unit)
             is_claimed = track.is_localized & counts
-            errors = np.hypot(*(track.poses - drive.truth)[is_claimed, :2].T)
-            key = (condition, name, sensors)
-            squares[key] = float((errors**2).sum()), len(errors)
-            wrong[key] = int((errors > 0.5 + 4.0 * MAPS[name].position).sum())
-    return Fusion(squares, samples, wrong)
+            distances = np.hypot(*(track.poses - drive.truth)[is_claimed, :2].T)
+            rms = float(np.sqrt((distances**2).mean())) if len(distances) else None
+            wrong = int((distances > 0.5 + 4.0 * MAPS[name].position).sum())
+            errors.append(Error(condition, name, sensors, rms, len(distances), int(counts.sum()), wrong))
+    return errors
 
 
-def through(seeds: Sequence[int], *, length: float, workers: int = 2) -> Iterator[Fusion]:
-    """Drive through the forests of some seeds in processes, and yield the errors in their order."""
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(partial(compared, length=length), seeds)
+@dataclass(frozen=True)
+class Summary:
+    """The errors over all forests, under one condition and with one map.
+
+    Attributes:
+        rms: RMS error of the position in m by sensors; NaN without a pose.
+        shares: The share of the sample times with a pose, by sensors.
+        wrong: The number of wrong claims, by sensors.
+        better: The number of forests in which both sensors err less than the better one of the two.
+        forests: The number of forests.
+    """
+
+    rms: Mapping[str, float]
+    shares: Mapping[str, float]
+    wrong: Mapping[str, int]
+    better: int
+    forests: int
 
 
-def report(forests: Sequence[Fusion]) -> str:
-    """Return the table of some forests."""
+def summary(forests: Forests, condition: str, name: str) -> Summary:
+    """Return the errors over all forests under a condition, with a map of this name."""
+    by_sensors = {
+        sensors: [
+            error
+            for errors in forests.values()
+            for error in errors
+            if (error.condition, error.map, error.sensors) == (condition, name, sensors)
+        ]
+        for sensors in SENSORS
+    }
+    least = {sensors: [inf if e.rms is None else e.rms for e in errors] for sensors, errors in by_sensors.items()}
+    alone = np.minimum(least["scanner"], least["cameras"])
+    poses = {sensors: sum(e.poses for e in errors) for sensors, errors in by_sensors.items()}
+    squares = {s: sum(e.poses * (e.rms or 0.0) ** 2 for e in errors) for s, errors in by_sensors.items()}
+    return Summary(
+        {s: float(np.sqrt(squares[s] / poses[s])) if poses[s] else nan for s in SENSORS},
+        {s: poses[s] / sum(e.samples for e in errors) for s, errors in by_sensors.items()},
+        {s: sum(e.wrong for e in errors) for s, errors in by_sensors.items()},
+        int((np.array(least["both"]) < alone).sum()),
+        len(forests),
+    )
+
+
+def report(forests: Forests) -> str:
+    """Return the table of the errors in some forests."""
     rows = []
-    for condition in CONDITIONS:
-        for name in MAP_NAMES:
-            cells = []
-            for sensors in SENSORS:
-                key = (condition, name, sensors)
-                total, count = np.sum([each.squares[key] for each in forests], axis=0)
-                share = count / sum(each.samples[condition] for each in forests)
-                false = sum(each.wrong[key] for each in forests)
-                cells.append(f"{np.sqrt(total / count):.3f} m in {share:.0%}, {false} wrong" if count else "no pose")
-            alone = [min(each.rms((condition, name, one)) for one in ("scanner", "cameras")) for each in forests]
-            better = sum(
-                each.rms((condition, name, "both")) < least for each, least in zip(forests, alone, strict=True)
-            )
-            rows.append((condition, name, *cells, f"{better} of {len(forests)}"))
+    for condition, name in product(CONDITIONS, MAP_NAMES):
+        each = summary(forests, condition, name)
+        cells = [f"{each.rms[s]:.3f} m in {each.shares[s]:.0%}, {each.wrong[s]} wrong" for s in SENSORS]
+        rows.append((condition, name, *cells, f"{each.better} of {each.forests}"))
     return table(("condition", "map", *SENSORS, "both better"), rows)
+
+
+def load() -> dict[int, list[Error]]:
+    """Return the errors that are kept in `FILE`.
+
+    Raises:
+        KeptResultsError: It is missing, or was changed.
+    """
+    return {int(seed): [Error(**error) for error in errors] for seed, errors in read_results(FILE).items()}
 
 
 @click.command(context_settings={"show_default": True})
 @click.option("--forests", default=20, help="Number of forests.")
-@click.option("--seed", default=SEED, help="Seed of the first forest.")
-@click.option("--length", default=20.0, help="The length of each drive in m.")
 @click.option("--workers", default=2, help="Number of processes.")
-def main(forests: int, seed: int, length: float, workers: int) -> None:
-    """Run the drives, and print the table."""
-    results = []
-    for fusion in through(range(seed, seed + forests), length=length, workers=workers):
-        results.append(fusion)
-        print(f"{len(results)} of {forests}", flush=True)
+def main(forests: int, workers: int) -> None:
+    """Drive through the forests that the file lacks, and print the table of all."""
+    results = load() if FILE.exists() else {}
+    seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for seed, errors in zip(seeds, pool.map(compared, seeds), strict=True):
+            results[seed] = errors
+            write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.fusion")
+            print(f"{len(results)} forests", flush=True)
     print(report(results))
 
 

@@ -14,7 +14,16 @@ from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, localize, recorded_drive
-from vtbdrake_diagrams.forest.studies.fusion import CONDITIONS, SHORT, Fusion, middle, report, seen_by
+from vtbdrake_diagrams.forest.studies.fusion import (
+    CONDITIONS,
+    MAP_NAMES,
+    SHORT,
+    Error,
+    middle,
+    report,
+    seen_by,
+    summary,
+)
 
 pytestmark = pytest.mark.one_python
 
@@ -89,17 +98,27 @@ def test_conditions_take_away_what_they_say() -> None:
     assert [each.is_scan for each in seen_by(drive, "both", usual).landmarks[2]] == [True, False]
 
 
-def test_report_counts_forests_in_which_both_are_better() -> None:
-    def errors(scanner: float, cameras: float, both: float) -> Fusion:
-        keys = [(condition, name) for condition in CONDITIONS for name in ("accurate", "remote")]
-        values = {"scanner": scanner, "cameras": cameras, "both": both}
-        squares = {(*key, one): (4.0 * error**2, 4) for key in keys for one, error in values.items()}
-        return Fusion(squares, dict.fromkeys(CONDITIONS, 8), dict.fromkeys(squares, 0))
+def test_forests_in_which_both_are_better_are_counted() -> None:
+    def errors(**rms: float | None) -> list[Error]:
+        return [
+            Error(condition, name, sensors, value, 4 if value else 0, 8, 1 if sensors == "cameras" else 0)
+            for condition in CONDITIONS
+            for name in MAP_NAMES
+            for sensors, value in rms.items()
+        ]
 
-    text = report([errors(0.1, 0.3, 0.09), errors(0.1, 0.05, 0.06)])
-    first = text.splitlines()[2]
-    assert "0.100 m in 50%" in first and "0.215 m in 50%" in first and "0.076 m in 50%" in first
-    assert first.rstrip().endswith("1 of 2")
+    forests = {
+        1: errors(scanner=0.1, cameras=0.3, both=0.09),
+        2: errors(scanner=0.1, cameras=0.05, both=0.06),
+        3: errors(scanner=0.2, cameras=None, both=0.1),
+    }
+    each = summary(forests, "as it is", "remote")
+    assert each.better == 2 and each.forests == 3
+    assert each.rms["scanner"] == pytest.approx(np.sqrt((0.1**2 + 0.1**2 + 0.2**2) / 3.0))
+    assert each.rms["cameras"] == pytest.approx(np.sqrt((0.3**2 + 0.05**2) / 2.0))
+    assert each.shares == pytest.approx({"scanner": 12 / 24, "cameras": 8 / 24, "both": 12 / 24})
+    assert each.wrong == {"scanner": 0, "cameras": 3, "both": 0}
+    assert "0.141 m in 50%, 0 wrong" in report(forests).splitlines()[2]
 
 
 def test_unit_has_a_message_for_each_sensor() -> None:
