@@ -1,13 +1,13 @@
-"""The driver's display: map, pose, covariance, landmarks and status of a running localization unit, live in Meshcat.
+"""The driver's display: map, pose, status, landmarks, advised route and next trees of a running unit, live in Meshcat.
 
 ``python -m vtbdrake_diagrams.forest.pictures.display SCENARIO --url URL`` is a process of its own. It watches the live
-values of a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and takes the map from the
-scenario.
+values of a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and takes the map and the
+routes from the scenario.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import click
 import numpy as np
@@ -29,7 +29,9 @@ from vtbdrake.monitoring.live.client import watch
 from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model
 from vtbdrake.visualization.world_model_drawing import text_strokes
+from vtbdrake_diagrams.forest.felling import marked_trees, next_places
 from vtbdrake_diagrams.forest.scenario import CarrierScenario
+from vtbdrake_diagrams.forest.world.routes import Route
 
 POSITION = "dps.env.pose.position"
 HEADING = "dps.env.pose.heading"
@@ -37,7 +39,8 @@ COVARIANCE = "dps.env.pose.covariance"
 STATUS = "dps.env.pose.status"
 FOUND_AT = "dps.env.localizer.pose"
 LANDMARKS = "dps.env.localizer.landmarks"
-WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS)
+ADVICE = "u.route"
+WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS, ADVICE)
 """The addresses that the display reads."""
 
 DEVIATIONS = 3.0
@@ -54,6 +57,16 @@ _LOOKS = {
 _TRUNK = Rgba(0.0, 0.45, 0.7, 1.0)
 # Colour of the ellipse of the position.
 _ELLIPSE = Rgba(0.8, 0.47, 0.65, 0.8)
+# Colour of the advised route.
+_ROUTE = Rgba(0.34, 0.71, 0.91, 1.0)
+# Height of the line of the advised route, in m.
+_ROUTE_HEIGHT = 0.1
+# Colour of the rings around the next trees to fell.
+_FELLED = Rgba(0.84, 0.37, 0.0, 1.0)
+# Radius of these rings, in m.
+_RING = 0.8
+# Largest number of these trees.
+_NEXT = 5
 # Height of the cylinders of the landmarks, in m.
 _TRUNK_HEIGHT = 1.5
 # Height of the letters over the carrier, in m.
@@ -69,22 +82,28 @@ _AMBIENT = 3.0
 
 
 class DriverDisplay:
-    """Draws map, pose and status of a localization unit into Meshcat, under ``display``.
+    """Draws map, pose, status and advice of a localization unit into Meshcat, under ``display``.
 
     The carrier is drawn at its pose, with the ellipse of its position (`DEVIATIONS`) on its roof, and the landmarks of
     the last scan as cylinders. The larger semi-axis of the ellipse is written beside the status. Without a pose, only
-    the map and the status are drawn, the latter at the last pose, or in the middle of the map. The drawing is moved so
-    that this place stays in the middle of the view, north up.
+    the map, the advised route and the status are drawn, the status at the last pose, or in the middle of the map. The
+    drawing is moved so that this place stays in the middle of the view, north up. Rings with numbers show the trees
+    that are felled next (`vtbdrake_diagrams.forest.felling`).
     """
 
-    def __init__(self, meshcat: Meshcat, world_map: WorldModel) -> None:
+    def __init__(self, meshcat: Meshcat, world_map: WorldModel, routes: Sequence[Route] = ()) -> None:
         """Draw the map.
 
         Args:
             meshcat: The Meshcat to draw into.
             world_map: The map of the unit.
+            routes: The routes by the number that is advised; without them, no advice is drawn.
         """
         self._meshcat = meshcat
+        self._routes = routes
+        self._marked = np.array([tree.p_WoOo_W[:2] for tree in marked_trees(world_map)]).reshape(-1, 2)
+        self._advised: int | None = None
+        self._felled = np.zeros((0, 2))
         self._text = ""
         self._landmarks = self._shown = 0
         show_world_model(meshcat, world_map, prefix="display/map", marker=_MARKER, deviations=0.0, label_height=0.0)
@@ -113,9 +132,29 @@ class DriverDisplay:
             X_WH = RigidTransform(RotationMatrix.MakeZRotation(pose[2]), self._place)
             self._meshcat.SetTransform("display/carrier", X_WH @ RigidTransform([0.0, 0.0, _ROOF / 2.0]))
             self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], covariance))
+        if self._routes:
+            self._show_advice(int(values_by_address[ADVICE]), pose if has_pose else None)
         self._show_landmarks(values_by_address[FOUND_AT], values_by_address[LANDMARKS].reshape(-1, 3))
         self._show_status(status, covariance)
         self._meshcat.SetTransform("display", RigidTransform(-self._place))
+
+    def _show_advice(self, number: int, pose: Array | None) -> None:
+        """Draw the advised route if it has changed, and the next trees along it if they have."""
+        route = self._routes[number]
+        if number != self._advised:
+            points = np.column_stack([route.points, np.full(len(route.points), _ROUTE_HEIGHT)])
+            self._meshcat.SetLine("display/route", np.vstack([points, points[:1]]).T, 4.0, _ROUTE)
+            self._advised = number
+        felled = np.zeros((0, 2)) if pose is None else next_places(self._marked, route, pose[:2], count=_NEXT)
+        if not np.array_equal(felled, self._felled):
+            self._meshcat.Delete("display/felled")
+            for k, place in enumerate(felled):
+                self._meshcat.SetLine(f"display/felled/{k}/ring", _ring(place), 4.0, _FELLED)
+                strokes = text_strokes(str(k + 1), _LETTERS)
+                self._meshcat.SetLineSegments(f"display/felled/{k}/number", *strokes, 2.0, _FELLED)
+                beside = RigidTransform([place[0] + _RING, place[1], _TRUNK_HEIGHT])
+                self._meshcat.SetTransform(f"display/felled/{k}/number", beside)
+            self._felled = felled
 
     def _show_landmarks(self, X_WH: Array, landmarks: Array) -> None:
         """Draw landmarks, rows of [x, y (m, in H), diameter (m)], where they were seen from the pose X_WH."""
@@ -150,13 +189,13 @@ class _Shown:
         url: The address of the Meshcat.
     """
 
-    def __init__(self, world_map: WorldModel) -> None:
-        self._map = world_map
+    def __init__(self, world_map: WorldModel, routes: Sequence[Route]) -> None:
+        self._map, self._routes = world_map, routes
         self._begin()
 
     def _begin(self) -> None:
         self._meshcat = make_meshcat()
-        self._display = DriverDisplay(self._meshcat, self._map)
+        self._display = DriverDisplay(self._meshcat, self._map, self._routes)
         self.url = self._meshcat.web_url()
 
     def show(self, values: Mapping[str, ArrayLike]) -> None:
@@ -182,6 +221,12 @@ def status_text(status: int, covariance: Array) -> str:
     if not np.isfinite(covariance).all():
         return words
     return f"{words} ±{DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]):.2f} m"
+
+
+def _ring(place: Array) -> Array:
+    """Return the points (3, n) of a ring around a tree, closed."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 25)
+    return np.vstack([place[0] + _RING * np.cos(angles), place[1] + _RING * np.sin(angles), np.full(25, _ROUTE_HEIGHT)])
 
 
 def ellipse(place: Array, covariance: Array) -> Array:
@@ -213,7 +258,7 @@ def main(scenario: Scenario, url: str, every: int, timeout: float) -> None:
     extra_module("uvicorn", purpose="the driver's display", extra="web")
     from vtbdrake.web.serving.host import Host
 
-    shown = _Shown(scenario.global_map())
+    shown = _Shown(scenario.global_map(), scenario.routes())
     host = Host(lambda: shown.url)
 
     def print_next() -> None:
