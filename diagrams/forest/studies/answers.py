@@ -15,6 +15,7 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.studies import fusion
 from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     REACH,
@@ -95,26 +96,29 @@ class LocalizationAnswer:
         scores: The scores of all drives by map.
         best: The unit beside the best estimate, with the map `BOUNDED`.
         machine: The unit fed over LCM beside the simulated one.
+        fused: Whether scanner and cameras in one filter are no worse than each alone, see `fusion.holds`.
     """
 
     scores: Mapping[str, Score]
     best: BestError
     machine: OverLcm
+    fused: bool
 
     @property
     def holds(self) -> bool:
-        """Return whether the goal of each map is met, without a wrong claim, and the same over LCM."""
+        """Return whether the goal of each map is met, without a wrong claim, the same over LCM, and fusion holds."""
         bounded = self.scores[BOUNDED]
         goals = all(GOALS[name].is_met(score) for name, score in self.scores.items() if name != BOUNDED)
         as_good = self.best.ratio <= LARGEST_RATIO and bounded.independent_nees <= bounded.bounds[1]
         sure = all(score.localized >= LEAST_LOCALIZED and not score.wrong for score in self.scores.values())
-        return self.machine.agrees and goals and as_good and sure
+        return self.machine.agrees and self.fused and goals and as_good and sure
 
 
 def localization(full: bool) -> Answer:
     """Answer C2: how accurately does the unit localize itself?
 
-    The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20.
+    The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20. The unit with scanner and
+    cameras was driven before (`fusion`).
     """
     drives = Drives(length=500.0 if full else 25.0)
     seeds = range(SEED, SEED + (20 if full else 4))
@@ -124,7 +128,7 @@ def localization(full: bool) -> Answer:
         {seed: by_map[BOUNDED] for seed, by_map in zip(seeds, tracks, strict=True)}, BOUNDED, scenario=drives.scenario
     )
     machine = over_lcm(ForestScenario(seed=1, length=60.0, width=60.0))
-    accurate = scores_by_map["accurate"]
+    accurate, fused = scores_by_map["accurate"], fusion.load()
     return Answer(
         id="C2",
         question="How well does a localization unit, developed in a virtual forest, know where it is among the trees?",
@@ -136,13 +140,28 @@ def localization(full: bool) -> Answer:
         held_out=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess",
         baseline=f"the best unbiased estimate with the {BOUNDED} map, {best.least:.2f} m",
         refused=sum(score.localized < LEAST_LOCALIZED for score in scores_by_map.values()),
-        holds=LocalizationAnswer(scores_by_map, best, machine).holds,
+        holds=LocalizationAnswer(scores_by_map, best, machine, fusion.holds(fused)).holds,
         note="; ".join(_summary(name, score) for name, score in scores_by_map.items())
         + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
         f"trees within {REACH:g} m of the path so far errs by {best.least:.2f} m (RMS); on these very maps the unit's "
         f"error is {best.ratio:.2f} times as large ({best.interval[0]:.2f} to {best.interval[1]:.2f} with "
         f"95 % over forests; at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
-        + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
+        + ("the pose is the same. " if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}. ")
+        + _fused(fused),
+    )
+
+
+def _fused(forests: fusion.Forests) -> str:
+    """Return what scanner and cameras in one filter gain, in words."""
+    each = {
+        condition: max((fusion.summary(forests, condition, name) for name in fusion.MAP_NAMES), key=lambda s: s.ratio)
+        for condition in fusion.CONDITIONS
+    }
+    ratios = ", ".join(f"{condition}: {one.ratio:.2f}" for condition, one in each.items())
+    verdict = "no worse" if fusion.holds(forests) else "WORSE"
+    return (
+        f"Scanner and cameras in one filter, in {len(forests)} other forests, are {verdict} than each alone. Error over "
+        f"the better one's, with the map where it is largest: {ratios}."
     )
 
 

@@ -9,6 +9,8 @@ drive.
 The criteria, fixed before any of the forests from `SEED` on was driven: the error of the position over all sample times
 of the judged part at which the unit claims a pose (RMS over all forests), the share of these times with a pose, wrong
 claims as `drives` counts them, and the number of forests in which both sensors err less than the better one of the two.
+Both must be no worse than each alone under each condition and with each map (`Summary.is_no_worse`), and better in most
+forests under one of them.
 """
 
 from __future__ import annotations
@@ -41,6 +43,10 @@ FILE = Path(__file__).with_suffix(".json")
 """The file in which the errors are kept."""
 SILENT = "scanner falls silent"
 """The condition that is judged from the middle of the drive on."""
+LARGEST_RATIO = 1.05
+"""The largest ratio of the error with both sensors to that of the better one alone, where both count as no worse."""
+LOST_SHARE = 0.02
+"""The share of poses that both sensors may have less than the one that has more."""
 SHORT = 12.0
 """The distance to which a scanner in dust or snow sees trunks, in m."""
 MAP_NAMES = ("accurate", "remote")
@@ -173,6 +179,23 @@ class Summary:
     wrong: Mapping[str, int]
     better: int
     forests: int
+
+    @property
+    def ratio(self) -> float:
+        """The RMS error with both sensors over the error with the better one alone."""
+        return self.rms["both"] / float(np.nanmin([self.rms["scanner"], self.rms["cameras"]]))
+
+    @property
+    def is_no_worse(self) -> bool:
+        """Return whether both are no worse than each alone: in error, in the share of poses, in wrong claims."""
+        alone = max(self.shares["scanner"], self.shares["cameras"])
+        return self.ratio <= LARGEST_RATIO and self.shares["both"] >= alone - LOST_SHARE and not self.wrong["both"]
+
+
+def holds(forests: Forests) -> bool:
+    """Return whether both sensors are no worse than each alone under all conditions, and better under one of them."""
+    each = [summary(forests, condition, name) for condition, name in product(CONDITIONS, MAP_NAMES)]
+    return all(one.is_no_worse for one in each) and any(2 * one.better > one.forests for one in each)
 
 
 def summary(forests: Forests, condition: str, name: str) -> Summary:

@@ -130,7 +130,9 @@ SCORES = {
     )
     for name, goal in GOALS.items()
 }
-KNOWN = LocalizationAnswer(SCORES, BestError(0.4, 0.4, 1.05, (1.0, 1.1)), OverLcm(is_tracking=True, difference=1e-5))
+KNOWN = LocalizationAnswer(
+    SCORES, BestError(0.4, 0.4, 1.05, (1.0, 1.1)), OverLcm(is_tracking=True, difference=1e-5), fused=True
+)
 
 
 def score(name: str, **changed: object) -> dict[str, object]:
@@ -156,6 +158,7 @@ def test_unit_that_knows_where_it_is_holds() -> None:
         {"best": BestError(0.4, 0.4, 1.11, (1.0, 1.2))},
         {"machine": OverLcm(is_tracking=False, difference=0.0)},
         {"machine": OverLcm(is_tracking=True, difference=0.01)},
+        {"fused": False},
     ],
 )
 def test_each_part_of_the_localization_can_fail(change: dict[str, object]) -> None:

@@ -19,6 +19,7 @@ from vtbdrake_diagrams.forest.studies.fusion import (
     MAP_NAMES,
     SHORT,
     Error,
+    holds,
     middle,
     report,
     seen_by,
@@ -119,6 +120,28 @@ def test_forests_in_which_both_are_better_are_counted() -> None:
     assert each.shares == pytest.approx({"scanner": 12 / 24, "cameras": 8 / 24, "both": 12 / 24})
     assert each.wrong == {"scanner": 0, "cameras": 3, "both": 0}
     assert "0.141 m in 50%, 0 wrong" in report(forests).splitlines()[2]
+
+
+@pytest.mark.parametrize(
+    ("both", "is_good"),
+    [
+        ({}, True),
+        ({"rms": 0.106}, False),
+        ({"poses": 7}, False),
+        ({"wrong": 1}, False),
+        ({"rms": 0.1}, False),  # no worse, but better nowhere
+    ],
+)
+def test_each_part_of_the_fusion_can_fail(both: dict[str, Any], is_good: bool) -> None:
+    scanner = {"rms": 0.1, "poses": 8, "samples": 8, "wrong": 0}
+    errors = []
+    for condition in CONDITIONS:
+        for name in MAP_NAMES:
+            changed = both if (condition, name) == ("as it is", "remote") or both == {"rms": 0.1} else {}
+            errors.append(Error(condition, name, "scanner", **scanner))
+            errors.append(Error(condition, name, "cameras", **scanner | {"rms": 0.3}))
+            errors.append(Error(condition, name, "both", **scanner | {"rms": 0.09} | changed))
+    assert holds({1: errors}) is is_good
 
 
 def test_unit_has_a_message_for_each_sensor() -> None:

@@ -86,15 +86,15 @@ class Submap:
         grown = self.covariances + J @ C_O @ J.transpose(0, 2, 1)
         return replace(self, X_OH=pose, distance=distance, covariances=grown)._select(distance - self.last <= length)
 
-    def with_scan(self, seen: Landmarks | Sighting, *, least_deviation: float) -> Submap:
+    def with_scan(self, landmarks: Landmarks | Sighting, *, least_deviation: float) -> Submap:
         """Return the map after a scan at its pose: detections are merged with landmarks that it has, or added.
 
         Args:
-            seen: The detections, in H.
+            landmarks: The detections, in H.
             least_deviation: Standard deviation in m that is added to the deviations of positions, see
                 `ConstellationMap`.
         """
-        sighting = Sighting.of(seen)
+        sighting = Sighting.of(landmarks)
         landmarks = sighting.landmarks
         if not len(landmarks):
             return self

@@ -193,7 +193,7 @@ class Tracker:
         object.__setattr__(self, "_association", association)
 
     def start(
-        self, X_WH: ArrayLike, covariance: ArrayLike, seen: Landmarks | Sighting | None = None
+        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | Sighting | None = None
     ) -> tuple[TrackState, Matches]:
         """Return the state at a first pose, and the matches of what is seen there.
 
@@ -203,13 +203,13 @@ class Tracker:
         Args:
             X_WH: The pose, shape (3,).
             covariance: The covariance of the pose, shape (3, 3).
-            seen: Detections in H at that pose; None starts with the given covariance.
+            landmarks: Detections in H at that pose; None starts with the given covariance.
         """
         pose = np.array(X_WH, dtype=float)
         state = self._at(pose, np.array(covariance, dtype=float))
-        if seen is None:
+        if landmarks is None:
             return state, _NO_MATCHES
-        sighting = self._widened(seen)
+        sighting = self._widened(landmarks)
         matches = self._associate(state, sighting).first(self.most)
         loose = self._at(pose, np.diag(_LOOSE**2))
         return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), sighting, matches.pairs)
@@ -245,14 +245,14 @@ class Tracker:
         P[ODOMETRY, ODOMETRY] += (1.0 - decay**2) * self.odometry_deviation**2
         return state.with_arrays(mean=mean, covariance=P)
 
-    def update(self, state: TrackState, seen: Landmarks | Sighting) -> tuple[TrackState, Matches]:
+    def update(self, state: TrackState, landmarks: Landmarks | Sighting) -> tuple[TrackState, Matches]:
         """Return the state after a scan, and its matches.
 
         Args:
             state: The state at the time of the scan.
-            seen: The detections, in H.
+            landmarks: The detections, in H.
         """
-        sighting = self._widened(seen)
+        sighting = self._widened(landmarks)
         if not len(sighting.landmarks):
             return state, _NO_MATCHES
         matches = self._associate(state, sighting)

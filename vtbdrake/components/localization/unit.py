@@ -153,7 +153,9 @@ class LocalizationUnit:
         """Return the memory before the first scan."""
         return UnitState()
 
-    def step(self, state: UnitState, seen: Seen, *, X_OH: ArrayLike, time: float) -> tuple[Localization, UnitState]:
+    def step(
+        self, state: UnitState, landmarks: Seen, *, X_OH: ArrayLike, time: float
+    ) -> tuple[Localization, UnitState]:
         """Return the answer to a scan, or to what several sensors see at one time, and the memory after it.
 
         The filter is one for all sensors: their sightings are fused one after the other.
@@ -163,7 +165,7 @@ class LocalizationUnit:
 
         Args:
             state: The memory before.
-            seen: The detections.
+            landmarks: The detections.
             X_OH: The pose of the carrier by odometry at the time of the scan, shape (3,).
             time: The time of the scan, in s.
 
@@ -173,7 +175,7 @@ class LocalizationUnit:
         pose = np.asarray(X_OH, dtype=float)
         if pose.shape != (3,):
             raise ValueError(f"X_OH is a planar pose [x, y, heading], shape (3,), not of shape {pose.shape}")
-        sightings = [Sighting(seen)] if isinstance(seen, Landmarks) else list(seen)
+        sightings = [Sighting(landmarks)] if isinstance(landmarks, Landmarks) else list(landmarks)
         last = state.answer
         if not ((np.abs(pose) < _LARGEST).all() and isfinite(time) and time > last.time):
             return last, replace(state, ignored=state.ignored + 1)
