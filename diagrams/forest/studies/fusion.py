@@ -187,7 +187,7 @@ class Summary:
 
     @property
     def is_no_worse(self) -> bool:
-        """Return whether both are no worse than each alone: in error, in the share of poses, in wrong claims."""
+        """Return whether both are no worse than each alone, in error, share of poses and wrong claims."""
         alone = max(self.shares["scanner"], self.shares["cameras"])
         return self.ratio <= LARGEST_RATIO and self.shares["both"] >= alone - LOST_SHARE and not self.wrong["both"]
 
