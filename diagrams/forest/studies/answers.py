@@ -160,8 +160,8 @@ def _fused(forests: fusion.Forests) -> str:
     ratios = ", ".join(f"{condition}: {one.ratio:.2f}" for condition, one in each.items())
     verdict = "no worse" if fusion.holds(forests) else "WORSE"
     return (
-        f"Scanner and cameras in one filter, in {len(forests)} other forests, are {verdict} than each alone. Error over "
-        f"the better one's, with the map where it is largest: {ratios}."
+        f"Scanner and cameras in one filter, in {len(forests)} other forests, are {verdict} than each alone. "
+        f"Error over the better one's, with the map where it is largest: {ratios}."
     )
 
 
