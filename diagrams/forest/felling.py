@@ -10,7 +10,7 @@ from vtbdrake.components.world_model import WorldModel, WorldObject
 from vtbdrake_diagrams.forest.world.routes import Route
 
 REACH = 10.0
-"""The reach of the crane from the road in m: that of usual harvesters."""
+"""The reach of the crane from the road in m, as of usual harvesters."""
 MARK = "fell"
 """The attribute of the trees that a forester has marked on the map: 1 for those to be felled, without a unit."""
 THINNED = 0.3

@@ -31,7 +31,7 @@ from vtbdrake.components.localization.dead_reckoning import (
     deskewed,
     history_size,
 )
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import chord, compose, inverse, rotation
 from vtbdrake.components.localization.unit import (
     LOST,
@@ -99,7 +99,7 @@ class LandmarkSensor:
         detect: The function that returns the landmarks in a scan or in images, such as `ScanLandmarks`.
         signals: The signals that ``detect`` takes, before the history and the time.
         field_of_view: Its horizontal field of view in rad.
-        is_scan: Whether its ranges have the bias that the tracker estimates, see `Sighting`.
+        is_scan: Whether its ranges have the bias that the tracker estimates, see `SensorView`.
     """
 
     detect: Callable[..., Landmarks]
@@ -111,7 +111,7 @@ class LandmarkSensor:
         """Return the times of its samples in s, among the inputs of a `Localizer`."""
         return [float(inputs[f"{name}_time"][0]) for name in self.signals]
 
-    def sighting(self, inputs: Mapping[str, Any], history: Array) -> Sighting:
+    def view(self, inputs: Mapping[str, Any], history: Array) -> SensorView:
         """Return what it detects, from the inputs of a `Localizer`.
 
         Samples of different times do not fit together: then nothing is detected, nor before `SETTLED`.
@@ -120,7 +120,7 @@ class LandmarkSensor:
         sees = min(times) == max(times) >= SETTLED
         samples = [inputs[name] for name in self.signals]
         landmarks = self.detect(*samples, history, times[0]) if sees else Landmarks.empty()
-        return Sighting(landmarks, self.field_of_view, self.is_scan)
+        return SensorView(landmarks, self.field_of_view, self.is_scan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +152,11 @@ class Localizer:
         groups = self._groups(inputs, after=memory.answer.time)
         with _blas().limit(limits=1, user_api="blas"):
             for taken, sensors in groups:
-                sightings = [sensor.sighting(inputs, history) for sensor in sensors]
+                views = [sensor.view(inputs, history) for sensor in sensors]
                 pose = carrier_pose_at(history, taken)
                 X_OH = [pose.x, pose.y, pose.heading]
-                answer, memory = self.unit.step(memory, sightings, X_OH=X_OH, time=taken)
-        landmarks = Landmarks.joined([sighting.landmarks for sighting in sightings])
+                answer, memory = self.unit.step(memory, views, X_OH=X_OH, time=taken)
+        landmarks = Landmarks.joined([view.landmarks for view in views])
         outputs = {
             "pose": answer.pose,
             "covariance": answer.covariance.ravel(),

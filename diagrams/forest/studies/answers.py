@@ -157,7 +157,7 @@ def _fused(forests: fusion.Forests) -> str:
         condition: max((fusion.summary(forests, condition, name) for name in fusion.MAP_NAMES), key=lambda s: s.ratio)
         for condition in fusion.CONDITIONS
     }
-    ratios = ", ".join(f"{condition}: {one.ratio:.2f}" for condition, one in each.items())
+    ratios = ", ".join(f"{condition}: {worst.ratio:.2f}" for condition, worst in each.items())
     verdict = "no worse" if fusion.holds(forests) else "WORSE"
     return (
         f"Scanner and cameras in one filter, in {len(forests)} other forests, are {verdict} than each alone. "

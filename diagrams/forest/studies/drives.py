@@ -35,9 +35,9 @@ from threadpoolctl import threadpool_limits
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
-from vtbdrake.components.localization.landmarks import Sighting
+from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake.components.localization.planar import wrap
-from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit, Seen
+from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit, Views
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.perception import LandmarkSensor
@@ -98,7 +98,7 @@ class Drive:
     times: Array
     truth: Array
     reckoned: Array
-    landmarks: tuple[Seen, ...]
+    landmarks: tuple[Views, ...]
     tilts: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
@@ -225,7 +225,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     testbed.write(context, {_SPEED: 0.0})
     limit = STANDING + 2.0 * length / scenario.speed + 10.0
     rows: list[tuple[float, Array, Array, Array]] = []
-    seen: list[Seen] = []
+    views: list[Views] = []
     travelled = 0.0
     for due, shown in _due(scenario.perception_periods):
         if travelled >= length:
@@ -244,11 +244,11 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         X_OH = np.array([reckoned_pose.x, reckoned_pose.y, reckoned_pose.heading])
         tilt = np.array([reckoned_pose.roll - roll, reckoned_pose.pitch - pitch])
         rows.append((taken, np.array([x, y, yaw]), X_OH, tilt))
-        seen.append([sensors[which].sighting(context, past) for which in shown])
+        views.append([sensors[which].view(context, past) for which in shown])
         if len(rows) > 1:
             travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
     times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
-    return Drive(times, truths, reckoned, tuple(seen), tilts)
+    return Drive(times, truths, reckoned, tuple(views), tilts)
 
 
 @dataclass(frozen=True)
@@ -273,12 +273,12 @@ class _SensorReader:
     def time(self, context: Context) -> float:
         return float(self.inputs[f"{self.sensor.signals[-1]}_time"](context))
 
-    def sighting(self, context: Context, history: Array) -> Sighting:
+    def view(self, context: Context, history: Array) -> SensorView:
         inputs = {
             name: np.atleast_1d(read(context)) if "_time" in name else read(context)
             for name, read in self.inputs.items()
         }
-        return self.sensor.sighting(inputs, history)
+        return self.sensor.view(inputs, history)
 
 
 def _due(periods: Sequence[float]) -> Iterator[tuple[float, list[int]]]:

@@ -29,7 +29,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
-from vtbdrake.components.localization.landmarks import Sighting
+from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS
@@ -44,7 +44,7 @@ FILE = Path(__file__).with_suffix(".json")
 SILENT = "scanner falls silent"
 """The condition that is judged from the middle of the drive on."""
 LARGEST_RATIO = 1.05
-"""The largest ratio of the error with both sensors to that of the better one alone, where both count as no worse."""
+"""The largest ratio of the error with both sensors to the error of the better one, where both count as no worse."""
 LOST_SHARE = 0.02
 """The share of poses that both sensors may have less than the one that has more."""
 SHORT = 12.0
@@ -55,33 +55,33 @@ SENSORS = {"scanner": "scanner", "cameras": "stereo", "both": "both"}
 """The perception of the scenario whose unit is used, by the name of the sensors."""
 
 
-def _as_it_is(sighting: Sighting, time: float, *, middle: float) -> Sighting:
-    return sighting
+def _as_it_is(view: SensorView, time: float, *, middle: float) -> SensorView:
+    return view
 
 
-def _short(sighting: Sighting, time: float, *, middle: float) -> Sighting:
-    if not sighting.is_scan:
-        return sighting
-    seen = sighting.landmarks
-    return replace(sighting, landmarks=seen.select(np.hypot(*seen.positions.T) < SHORT))
+def _short(view: SensorView, time: float, *, middle: float) -> SensorView:
+    if not view.is_scan:
+        return view
+    trunks = view.landmarks
+    return replace(view, landmarks=trunks.select(np.hypot(*trunks.positions.T) < SHORT))
 
 
-def _silent(sighting: Sighting, time: float, *, middle: float) -> Sighting | None:
-    return None if sighting.is_scan and time > middle else sighting
+def _silent(view: SensorView, time: float, *, middle: float) -> SensorView | None:
+    return None if view.is_scan and time > middle else view
 
 
-CONDITIONS: Mapping[str, Callable[..., Sighting | None]] = {
+CONDITIONS: Mapping[str, Callable[..., SensorView | None]] = {
     "as it is": _as_it_is,
     f"scanner sees {SHORT:g} m": _short,
     SILENT: _silent,
 }
-"""The conditions: functions that return what is left of a sighting at a time, with the middle of the drive."""
+"""The conditions: functions that return what is left of a view at a time, with the middle of the drive."""
 
 
 def seen_by(drive: Drive, sensors: str, condition: str) -> Drive:
     """Return the drive with what some of the sensors see under a condition.
 
-    Samples without anything are left in, without sightings: the carrier moves on by dead reckoning.
+    Samples without anything are left in, without views: the carrier moves on by dead reckoning.
 
     Args:
         drive: The drive of a carrier with both sensors.
@@ -89,10 +89,10 @@ def seen_by(drive: Drive, sensors: str, condition: str) -> Drive:
         condition: One of `CONDITIONS`.
     """
     see = partial(CONDITIONS[condition], middle=middle(drive))
-    wanted = {"scanner": (True,), "cameras": (False,), "both": (True, False)}[sensors]
+    kinds = {"scanner": (True,), "cameras": (False,), "both": (True, False)}[sensors]
     landmarks = []
-    for time, sightings in zip(drive.times, drive.landmarks, strict=True):
-        remaining = [see(sighting, time) for sighting in sightings if sighting.is_scan in wanted]
+    for time, views in zip(drive.times, drive.landmarks, strict=True):
+        remaining = [see(view, time) for view in views if view.is_scan in kinds]
         # Cameras alone are the sensor whose bias is estimated, as in their scenario.
         landmarks.append([replace(each, is_scan=each.is_scan or sensors == "cameras") for each in remaining if each])
     return replace(drive, landmarks=tuple(landmarks))
@@ -194,8 +194,9 @@ class Summary:
 
 def holds(forests: Forests) -> bool:
     """Return whether both sensors are no worse than each alone under all conditions, and better under one of them."""
-    each = [summary(forests, condition, name) for condition, name in product(CONDITIONS, MAP_NAMES)]
-    return all(one.is_no_worse for one in each) and any(2 * one.better > one.forests for one in each)
+    summaries = [summary(forests, condition, name) for condition, name in product(CONDITIONS, MAP_NAMES)]
+    is_no_worse = all(summary.is_no_worse for summary in summaries)
+    return is_no_worse and any(2 * summary.better > summary.forests for summary in summaries)
 
 
 def summary(forests: Forests, condition: str, name: str) -> Summary:

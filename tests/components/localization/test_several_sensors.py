@@ -9,7 +9,7 @@ import pytest
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.constellation import ConstellationMap
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import rotation
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.components.localization.tracking import Tracker
@@ -40,18 +40,18 @@ def test_sensors_are_fused_with_the_weights_of_their_covariances() -> None:
     state, _ = filter.start(np.zeros(3), SURELY)
     truth = np.array([0.02, -0.03, 0.004])
     to_carrier = rotation(-truth[2])
-    sightings, rows = [], []
+    views, rows = [], []
     for which, deviation, is_scan in ((np.arange(30), 0.05, True), (AHEAD, 0.15, False)):
         exact = (PLACES[which] - truth[:2]) @ to_carrier.T
         noisy = exact + deviation * rng.normal(size=exact.shape)
-        sightings.append(Sighting(seen(noisy, deviation), VIEW if not is_scan else 2.0 * np.pi, is_scan))
+        views.append(SensorView(seen(noisy, deviation), VIEW if not is_scan else 2.0 * np.pi, is_scan))
         for (x, y), detected, expected in zip(PLACES[which], noisy, PLACES[which], strict=True):
             # A detection is R(-theta) (l - p): to first order about 0, l - p + theta [y, -x].
             rows += [([-1.0, 0.0, y], detected[0] - expected[0], deviation)]
             rows += [([0.0, -1.0, -x], detected[1] - expected[1], deviation)]
-    for sighting in sightings:
-        state, matches = filter.update(state, sighting)
-        assert matches.is_fused and len(matches.pairs) == len(sighting.landmarks)
+    for view in views:
+        state, matches = filter.update(state, view)
+        assert matches.is_fused and len(matches.pairs) == len(view.landmarks)
     # The estimate of Gauss and Markov by all detections at once.
     A, b, deviations = (np.array(column) for column in zip(*rows, strict=True))
     weighted = A / deviations[:, None]
@@ -68,11 +68,11 @@ def test_range_bias_is_the_scanner_s_alone() -> None:
     farther = seen(PLACES * (1.0 + 0.05 / distances), 0.01)
     scanned, _ = filter.update(start, farther)
     assert scanned.range_bias == pytest.approx(0.05, abs=0.005)
-    other, matches = filter.update(start, Sighting(seen(PLACES, 0.01), is_scan=False))
+    other, matches = filter.update(start, SensorView(seen(PLACES, 0.01), is_scan=False))
     assert matches.is_fused and other.range_bias == 0.0
     assert other.covariance[3, 3] == pytest.approx(0.1**2)
     # After the scan, exact detections of the other sensor contradict neither the bias nor the map.
-    after, matches = filter.update(scanned, Sighting(seen(PLACES, 0.01), is_scan=False))
+    after, matches = filter.update(scanned, SensorView(seen(PLACES, 0.01), is_scan=False))
     assert len(matches.pairs) == len(PLACES) and after.range_bias == pytest.approx(0.05, abs=0.005)
 
 
@@ -80,7 +80,7 @@ def test_what_lies_outside_of_a_view_is_not_missed() -> None:
     filter = tracker()
     state, _ = filter.update(filter.start(np.zeros(3), SURELY)[0], seen(PLACES, 0.05))
     assert state.is_recent.sum() == len(PLACES)
-    few = Sighting(seen(PLACES[AHEAD], 0.1), VIEW, is_scan=False)
+    few = SensorView(seen(PLACES[AHEAD], 0.1), VIEW, is_scan=False)
     # For a sensor that sees all around, they would be too few.
     assert filter.update(state, few.landmarks)[0].failures == 1
     fused, _ = filter.update(state, few)
@@ -96,7 +96,7 @@ def test_places_outside_of_a_view_have_had_no_chance() -> None:
     behind, ahead = [[-4.0, 1.0]], [[5.0, 0.5], [8.0, -1.0]]
     gathered = Submap.empty().with_scan(seen(np.array(behind), 0.02), least_deviation=0.02)
     for _ in range(4):
-        gathered = gathered.with_scan(Sighting(seen(np.array(ahead), 0.02), VIEW), least_deviation=0.02)
+        gathered = gathered.with_scan(SensorView(seen(np.array(ahead), 0.02), VIEW), least_deviation=0.02)
     assert len(gathered.landmarks()) == 3
     for _ in range(4):
         gathered = gathered.with_scan(seen(np.array(ahead), 0.02), least_deviation=0.02)
@@ -106,7 +106,7 @@ def test_places_outside_of_a_view_have_had_no_chance() -> None:
 def test_unit_takes_all_that_is_seen_at_one_time() -> None:
     survey = seen(PLACES, 0.05)
     unit = LocalizationUnit(ConstellationMap(survey), Tracker(survey))
-    both = [Sighting(seen(PLACES, 0.03)), Sighting(seen(PLACES[AHEAD], 0.1), VIEW, is_scan=False)]
+    both = [SensorView(seen(PLACES, 0.03)), SensorView(seen(PLACES[AHEAD], 0.1), VIEW, is_scan=False)]
     answer, state = unit.step(unit.start(), both, X_OH=np.zeros(3), time=0.0)
     assert answer.status == TRACKING and answer.detected == len(PLACES) + len(AHEAD)
     answer, state = unit.step(state, both, X_OH=np.zeros(3), time=0.2)
@@ -124,4 +124,4 @@ def test_unit_takes_all_that_is_seen_at_one_time() -> None:
 @pytest.mark.parametrize("view", [0.0, 7.0, np.nan])
 def test_impossible_views_are_refused(view: float) -> None:
     with pytest.raises(ValueError, match="a field of view is above 0 and at most 2 pi rad"):
-        replace(Sighting(seen(PLACES, 0.1)), field_of_view=view)
+        replace(SensorView(seen(PLACES, 0.1)), field_of_view=view)

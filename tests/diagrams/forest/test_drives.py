@@ -130,8 +130,8 @@ def test_recorded_cameras_see_trees_where_they_are() -> None:
     drive = recorded_drive(scenario, length=0.2)
     assert np.diff(drive.times) == pytest.approx(1.0 / scenario.stereo.fps)
     squares = []
-    for pose, [sighting] in zip(drive.truth, drive.landmarks, strict=True):
-        landmarks = sighting.landmarks
+    for pose, [view] in zip(drive.truth, drive.landmarks, strict=True):
+        landmarks = view.landmarks
         trees = map_landmarks(scenario.truth()).seen_from(inverse(pose)).positions
         errors = landmarks.positions[:, np.newaxis] - trees
         inverses = np.linalg.inv(landmarks.covariances)

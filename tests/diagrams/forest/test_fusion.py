@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
@@ -82,8 +82,8 @@ def test_samples_are_fused_once_in_the_order_of_their_times() -> None:
 def test_conditions_take_away_what_they_say() -> None:
     times = STANDING + np.array([1.0, 2.0, 3.0, 4.0])
     pose = np.zeros((4, 3))
-    sightings = [Sighting(at([4.0, SHORT + 1.0])), Sighting(at([15.0]), 1.3, is_scan=False)]
-    drive = Drive(times, pose, pose, (sightings[:1], sightings[1:], sightings, sightings[:1]))
+    views = [SensorView(at([4.0, SHORT + 1.0])), SensorView(at([15.0]), 1.3, is_scan=False)]
+    drive = Drive(times, pose, pose, (views[:1], views[1:], views, views[:1]))
     assert middle(drive) == STANDING + 2.0
 
     def counts(sensors: str, condition: str) -> list[list[int]]:
@@ -156,7 +156,7 @@ def test_unit_has_a_message_for_each_sensor() -> None:
 @pytest.mark.slow
 def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     drive = recorded_drive(SCENARIO, length=1.5)
-    kinds = [[each.is_scan for each in sightings] for sightings in drive.landmarks]
+    kinds = [[each.is_scan for each in views] for views in drive.landmarks]
     assert kinds[:6] == [[True], [True], [False], [True], [True], [True, False]]
     found = localize(drive, SCENARIO.unit(SCENARIO.global_map()))
     testbed = SCENARIO.build()

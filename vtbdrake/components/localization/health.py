@@ -30,7 +30,7 @@ from scipy.linalg import solve_triangular
 
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
-from vtbdrake.components.localization.landmarks import Sighting
+from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake.components.localization.track_state import TrackState, in_level_frame
 
 # A scan fails if it matches a smaller share of its detections.
@@ -69,12 +69,12 @@ _TANGLED = 10.0
 _CHANCE = 0.2
 
 
-def judged(state: TrackState, sighting: Sighting, pairs: Indices) -> tuple[bool, Array]:
+def judged(state: TrackState, view: SensorView, pairs: Indices) -> tuple[bool, Array]:
     """Return whether a scan with these pairs of detection and landmark, (k, 2), fails, and what is still to be judged.
 
     Args:
         state: The state before the scan.
-        sighting: The detections of the scan, in H.
+        view: The detections of the scan, in H.
         pairs: Indices of the detection and of the landmark on the map.
 
     Returns:
@@ -82,9 +82,9 @@ def judged(state: TrackState, sighting: Sighting, pairs: Indices) -> tuple[bool,
     """
     matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
     recent = in_level_frame(state, state.landmark_positions[state.is_recent])
-    expected = int(sighting.is_in_view(recent, share=_RELIABLE).sum())
+    expected = int(view.is_in_view(recent, share=_RELIABLE).sum())
     fails, unjudged = False, np.zeros((2, 2))
-    scan = np.array([[len(sighting.landmarks), matched], [expected, again]], dtype=float)
+    scan = np.array([[len(view.landmarks), matched], [expected, again]], dtype=float)
     for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN)):
         # A scan with many is judged alone: those before it show another place.
         count, matches = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]

@@ -89,7 +89,7 @@ class Landmarks:
 
 
 @immutable
-class Sighting:
+class SensorView:
     """The landmarks that one of several sensors detects at one time, and where it looks.
 
     Attributes:
@@ -111,12 +111,12 @@ class Sighting:
             raise ValueError(f"a field of view is above 0 and at most 2 pi rad, not {self.field_of_view!r}")
 
     @classmethod
-    def of(cls, seen: Landmarks | Sighting) -> Sighting:
-        """Return a sighting as it is, and landmarks as those of a scanner that sees all around."""
-        return seen if isinstance(seen, Sighting) else cls(seen)
+    def of(cls, landmarks: Landmarks | SensorView) -> SensorView:
+        """Return a view as it is, and landmarks as the view of a scanner that sees all around."""
+        return landmarks if isinstance(landmarks, SensorView) else cls(landmarks)
 
     def is_in_view(self, positions: ArrayLike, *, share: float) -> NDArray[np.bool_]:
-        """Return which places are in view, shape (n,): within a share of the largest distance of detections.
+        """Return whether places are in view, shape (n,): within a share of the largest distance of detections.
 
         Args:
             positions: The places in H, shape (n, 2).

@@ -15,7 +15,7 @@ from vtbdrake.components.estimation import (
     squared_distances,
     weighted_mean,
 )
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import inverse, rotation, transform
 
 # The share of right pairs that the gate of the association lets pass.
@@ -86,7 +86,7 @@ class Submap:
         grown = self.covariances + J @ C_O @ J.transpose(0, 2, 1)
         return replace(self, X_OH=pose, distance=distance, covariances=grown)._select(distance - self.last <= length)
 
-    def with_scan(self, landmarks: Landmarks | Sighting, *, least_deviation: float) -> Submap:
+    def with_scan(self, landmarks: Landmarks | SensorView, *, least_deviation: float) -> Submap:
         """Return the map after a scan at its pose: detections are merged with landmarks that it has, or added.
 
         Args:
@@ -94,8 +94,8 @@ class Submap:
             least_deviation: Standard deviation in m that is added to the deviations of positions, see
                 `ConstellationMap`.
         """
-        sighting = Sighting.of(landmarks)
-        landmarks = sighting.landmarks
+        view = SensorView.of(landmarks)
+        landmarks = view.landmarks
         if not len(landmarks):
             return self
         scan = landmarks.seen_from(self.X_OH)
@@ -114,7 +114,7 @@ class Submap:
         hits, last = self.seen.copy(), self.last.copy()
         hits[old] += 1.0
         last[old] = self.distance
-        in_view = sighting.is_in_view(transform(inverse(self.X_OH), positions), share=_IN_VIEW)
+        in_view = view.is_in_view(transform(inverse(self.X_OH), positions), share=_IN_VIEW)
         in_view[old] = True
         rest = np.setdiff1d(np.arange(len(landmarks)), new)
         once = np.ones(len(rest))

@@ -103,5 +103,10 @@ class TrackState:
 
 
 def in_level_frame(state: TrackState, places: Array) -> Array:
-    """Return places (n, 2) in W as they are in the level frame H of the carrier at the estimated pose, (n, 2)."""
+    """Return places in the level frame H of the carrier at the estimated pose, (n, 2).
+
+    Args:
+        state: The state.
+        places: The places in W, (n, 2).
+    """
     return (places - state.mean[:2]) @ rotation(-state.mean[2]).T

@@ -8,7 +8,7 @@ each scan would become overconfident, because it is the same error. A detection 
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
-where s is the position of the scanner; for a sensor of another kind beside it (`Sighting.is_scan`), b is 0. This is
+where s is the position of the scanner; for a sensor of another kind beside it (`SensorView.is_scan`), b is 0. This is
 EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous localization and mapping: part I", IEEE Robotics &
 Automation Magazine 13, 2006). Landmarks far behind are marginalized.
 
@@ -52,7 +52,7 @@ from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization import health
 from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState, in_level_frame
 
@@ -109,7 +109,7 @@ class Tracker:
     )
     field_of_view: float = setting(
         2.0 * pi,
-        "The horizontal field of view, for the density of detections; a `Sighting` may have a narrower one.",
+        "The horizontal field of view, for the density of detections; a `SensorView` may have a narrower one.",
         unit="rad",
         gt=0.0,
         le=2.0 * pi,
@@ -193,7 +193,7 @@ class Tracker:
         object.__setattr__(self, "_association", association)
 
     def start(
-        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | Sighting | None = None
+        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | SensorView | None = None
     ) -> tuple[TrackState, Matches]:
         """Return the state at a first pose, and the matches of what is seen there.
 
@@ -209,10 +209,10 @@ class Tracker:
         state = self._at(pose, np.array(covariance, dtype=float))
         if landmarks is None:
             return state, _NO_MATCHES
-        sighting = self._widened(landmarks)
-        matches = self._associate(state, sighting).first(self.most)
+        view = self._widened(landmarks)
+        matches = self._associate(state, view).first(self.most)
         loose = self._at(pose, np.diag(_LOOSE**2))
-        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), sighting, matches.pairs)
+        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), view, matches.pairs)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, extent: float) -> TrackState:
         """Return the state after a motion.
@@ -245,23 +245,23 @@ class Tracker:
         P[ODOMETRY, ODOMETRY] += (1.0 - decay**2) * self.odometry_deviation**2
         return state.with_arrays(mean=mean, covariance=P)
 
-    def update(self, state: TrackState, landmarks: Landmarks | Sighting) -> tuple[TrackState, Matches]:
+    def update(self, state: TrackState, landmarks: Landmarks | SensorView) -> tuple[TrackState, Matches]:
         """Return the state after a scan, and its matches.
 
         Args:
             state: The state at the time of the scan.
             landmarks: The detections, in H.
         """
-        sighting = self._widened(landmarks)
-        if not len(sighting.landmarks):
+        view = self._widened(landmarks)
+        if not len(view.landmarks):
             return state, _NO_MATCHES
-        matches = self._associate(state, sighting)
+        matches = self._associate(state, view)
         failed = replace(
             state.with_arrays(unjudged=np.zeros((2, 2))),
             failures=state.failures + 1,
             drift=health.drift_after_failure(state),
         )
-        fails, unjudged = health.judged(state, sighting, matches.pairs)
+        fails, unjudged = health.judged(state, view, matches.pairs)
         if fails:
             return failed, Matches(matches.pairs)
         if len(matches.pairs) < 2:
@@ -269,9 +269,9 @@ class Tracker:
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
-        fused, remaining = self._fused(extended, sighting, np.vstack([matches.pairs[~is_first], first.pairs]))
+        fused, remaining = self._fused(extended, view, np.vstack([matches.pairs[~is_first], first.pairs]))
         # Too few of the pairs may be left.
-        fails, unjudged = health.judged(state, sighting, remaining.pairs)
+        fails, unjudged = health.judged(state, view, remaining.pairs)
         if fails:
             return failed, Matches(remaining.pairs)
         evidence = min(self.credit, state.evidence + health.evidence(first.squares, self.first_gate))
@@ -296,9 +296,9 @@ class Tracker:
         """Return the covariance of X_WH, (3, 3), larger than the filter's if the map seems distorted."""
         return state.pose_covariance * health.widening(state)
 
-    def _widened(self, seen: Landmarks | Sighting) -> Sighting:
-        sighting = Sighting.of(seen)
-        return replace(sighting, landmarks=sighting.landmarks.widened(self.least_deviation))
+    def _widened(self, landmarks: Landmarks | SensorView) -> SensorView:
+        view = SensorView.of(landmarks)
+        return replace(view, landmarks=view.landmarks.widened(self.least_deviation))
 
     def _at(self, X_WH: Array, covariance: Array) -> TrackState:
         P = block_diag(covariance, self.bias_deviation**2, self.odometry_deviation**2, self.rate_deviation**2)
@@ -349,30 +349,30 @@ class Tracker:
         M[np.diag_indices_from(M)] = variances
         return M
 
-    def _associate(self, state: TrackState, sighting: Sighting) -> MatchedPairs:
+    def _associate(self, state: TrackState, view: SensorView) -> MatchedPairs:
         """Return the matches of detections with the map around the pose of a state."""
-        detections = sighting.landmarks
+        detections = view.landmarks
         near = self._association.nearby(state.pose, state.pose_covariance, detections)
         if not len(near):
             return MatchedPairs.none()
         extended = self._extended(state, near[~np.isin(near, state.indices)])
         rows = np.flatnonzero(np.isin(extended.indices, near))
-        positions, H = self._expected(extended, rows, is_scan=sighting.is_scan)
+        positions, H = self._expected(extended, rows, is_scan=view.is_scan)
         HPHt = _times(H, rows, _times_transpose(extended.covariance, H, rows))
         covariance = HPHt.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
         is_first = rows >= len(state.indices)
         expected = ExpectedDetections(extended.indices[rows], is_first, positions, covariance)
         return self._association.matched(
-            detections, expected, field_of_view=min(self.field_of_view, sighting.field_of_view)
+            detections, expected, field_of_view=min(self.field_of_view, view.field_of_view)
         )
 
-    def _fused(self, state: TrackState, sighting: Sighting, pairs: Indices) -> tuple[TrackState, Matches]:
+    def _fused(self, state: TrackState, view: SensorView, pairs: Indices) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
-        detections = sighting.landmarks
+        detections = view.landmarks
         # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
         while len(pairs):
             rows = _rows_of(state.indices, pairs[:, 1])
-            expected, H = self._expected(state, rows, is_scan=sighting.is_scan)
+            expected, H = self._expected(state, rows, is_scan=view.is_scan)
             nu = (detections.positions[pairs[:, 0]] - expected).ravel()
             PHt = _times_transpose(state.covariance, H, rows)
             S = _times(H, rows, PHt) + block_diag(*detections.covariances[pairs[:, 0]])
@@ -388,7 +388,7 @@ class Tracker:
         K = cho_solve(factor, PHt.T).T
         P = state.covariance - PHt @ K.T
         mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
-        is_in_view = sighting.is_in_view(in_level_frame(state, state.landmark_positions), share=inf)
+        is_in_view = view.is_in_view(in_level_frame(state, state.landmark_positions), share=inf)
         is_recent = np.where(is_in_view, np.isin(state.indices, pairs[:, 1]), state.is_recent)
         fused = state.with_arrays(mean=mean, covariance=P, is_recent=is_recent)
         distance = np.hypot(*(fused.landmark_positions - mean[:2]).T)

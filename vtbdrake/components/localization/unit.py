@@ -18,7 +18,7 @@ from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
-from vtbdrake.components.localization.landmarks import Landmarks, Sighting
+from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.components.localization.track_state import TrackState
@@ -42,8 +42,8 @@ _LARGEST = 1e9
 # The fewest matched detections with which a track begins.
 _FEWEST = 4
 
-Seen = Landmarks | Sequence[Sighting]
-"""Detections of one time in H: a scanner's landmarks, or sightings of several sensors, each with its covariances."""
+Views = Landmarks | Sequence[SensorView]
+"""Detections of one time in H: a scanner's landmarks, or views of several sensors, each with its covariances."""
 
 
 @immutable
@@ -154,11 +154,11 @@ class LocalizationUnit:
         return UnitState()
 
     def step(
-        self, state: UnitState, landmarks: Seen, *, X_OH: ArrayLike, time: float
+        self, state: UnitState, landmarks: Views, *, X_OH: ArrayLike, time: float
     ) -> tuple[Localization, UnitState]:
         """Return the answer to a scan, or to what several sensors see at one time, and the memory after it.
 
-        The filter is one for all sensors: their sightings are fused one after the other.
+        The filter is one for all sensors: their views are fused one after the other.
 
         A call with a pose or a time that is not finite, a pose of 1e9 m or more, or a time that is not after the last
         one, is ignored and counted. It returns the last answer, with the time of that answer.
@@ -175,7 +175,7 @@ class LocalizationUnit:
         pose = np.asarray(X_OH, dtype=float)
         if pose.shape != (3,):
             raise ValueError(f"X_OH is a planar pose [x, y, heading], shape (3,), not of shape {pose.shape}")
-        sightings = [Sighting(landmarks)] if isinstance(landmarks, Landmarks) else list(landmarks)
+        views = [SensorView(landmarks)] if isinstance(landmarks, Landmarks) else list(landmarks)
         last = state.answer
         if not ((np.abs(pose) < _LARGEST).all() and isfinite(time) and time > last.time):
             return last, replace(state, ignored=state.ignored + 1)
@@ -189,31 +189,31 @@ class LocalizationUnit:
             extent = self.drift.extent(motion, duration)
             track = self.tracker.predict(state.track, motion, C, extent=extent)
             fused = []
-            for sighting in sightings:
-                track, matches = self.tracker.update(track, sighting)
+            for view in views:
+                track, matches = self.tracker.update(track, view)
                 fused.append(matches)
             is_doubtful = self.tracker.is_doubtful(track)
             doubted = state.doubted + float(np.hypot(*motion[:2])) if is_doubtful else 0.0
             if self.tracker.is_lost(track) or doubted > self.doubt_length:
                 # What was seen in doubt is of the same place.
-                lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=_count(sightings))
-                submap = self._gathered(state.submap, sightings, pose, C)
+                lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=_count(views))
+                submap = self._gathered(state.submap, views, pose, C)
                 return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
             if is_doubtful:
-                answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=_count(sightings))
-                submap = self._gathered(state.submap, sightings, pose, C)
+                answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=_count(views))
+                submap = self._gathered(state.submap, views, pose, C)
             else:
-                answer = self._answer(track, fused, _count(sightings), pose, time)
+                answer = self._answer(track, fused, _count(views), pose, time)
                 submap = Submap.empty(pose)
             return answer, replace(state, answer=answer, track=track, submap=submap, doubted=doubted)
-        return self._searched(state, sightings, pose, C, time)
+        return self._searched(state, views, pose, C, time)
 
     def _searched(
-        self, state: UnitState, sightings: Sequence[Sighting], X_OH: Array, C: Array, time: float
+        self, state: UnitState, views: Sequence[SensorView], X_OH: Array, C: Array, time: float
     ) -> tuple[Localization, UnitState]:
         """Return the answer and the memory after a scan that follows an answer without a pose."""
-        submap = self._gathered(state.submap, sightings, X_OH, C)
-        none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=_count(sightings))
+        submap = self._gathered(state.submap, views, X_OH, C)
+        none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=_count(views))
         state = replace(state, answer=none, submap=submap)
         gathered = submap.landmarks()
         is_due = (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any()
@@ -224,18 +224,18 @@ class LocalizationUnit:
         if not fix.is_sure:
             return none, state
         # The sensor that sees most begins the track.
-        most = max(sightings, key=lambda sighting: len(sighting.landmarks), default=Sighting(Landmarks.empty()))
+        most = max(views, key=lambda view: len(view.landmarks), default=SensorView(Landmarks.empty()))
         track, matches = self.tracker.start(fix.pose, fix.covariance, gathered if self.begins_with_submap else most)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
-        answer = self._answer(track, [matches], _count(sightings), X_OH, time)
+        answer = self._answer(track, [matches], _count(views), X_OH, time)
         return answer, UnitState(answer, track, Submap.empty(X_OH), ignored=state.ignored, losses=state.losses)
 
-    def _gathered(self, submap: Submap, sightings: Sequence[Sighting], X_OH: Array, C: Array) -> Submap:
+    def _gathered(self, submap: Submap, views: Sequence[SensorView], X_OH: Array, C: Array) -> Submap:
         """Return the submap after a motion with covariance C and what is seen then."""
         gathered = submap.moved(X_OH, C, length=self.submap_length)
-        for sighting in sightings:
-            gathered = gathered.with_scan(sighting, least_deviation=self.locator.least_deviation)
+        for view in views:
+            gathered = gathered.with_scan(view, least_deviation=self.locator.least_deviation)
         return gathered
 
     def _answer(
@@ -247,9 +247,9 @@ class LocalizationUnit:
         return Localization(time, X_OH, track.pose, covariance, TRACKING, detected, matched, nis, track.range_bias)
 
 
-def _count(sightings: Sequence[Sighting]) -> int:
+def _count(views: Sequence[SensorView]) -> int:
     """Return the number of detections."""
-    return sum(len(sighting.landmarks) for sighting in sightings)
+    return sum(len(view.landmarks) for view in views)
 
 
 _CODEC = codec_of(UnitState())
