@@ -119,6 +119,7 @@ class Wrong:
     covariance: np.ndarray
     is_sure: bool = True
     least_deviation: float = 0.02
+    fewest: int = 2
 
     def locate(self, local):
         return self
@@ -137,6 +138,13 @@ def test_matching_is_tried_after_some_metres_or_seconds(speed, calls):
         if state.tried_at[1] != before:
             tried.append(k)
     assert tried == calls
+
+
+def test_too_few_landmarks_use_no_attempt_up():
+    one = drive(3, ACCURATE, reach=18.0)
+    few = one.scans[0].select(range(5))
+    answers, state = run(unit_on(3), [few, *one.scans[1:4]], one.reckoned[:4])
+    assert answers[0].status == SEARCHING and state.answer.status == TRACKING
 
 
 @pytest.mark.slow_cases
