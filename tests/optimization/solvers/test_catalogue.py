@@ -275,9 +275,10 @@ def _zakharov(p):
 
 @pytest.mark.one_python
 @pytest.mark.parametrize("seed", [21, 22])
-def test_auto_finds_a_minimum_exactly_in_a_hundred_evaluations(seed):
+def test_auto_finds_a_minimum_closely_in_a_hundred_evaluations(seed):
+    """By rounding, it ends between 6e-5 and 4e-3, with the kernels of OpenBLAS for four kinds of processors."""
     solver = make_solver("auto", box(3, -5.0, 8.0), seed=seed, budget=100)
-    assert -max(e.values[0] for e in drive(solver, _zakharov)) < 1e-3
+    assert -max(e.values[0] for e in drive(solver, _zakharov)) < 0.01
 
 
 def test_auto_begins_with_any_budget_as_with_a_larger_one():
