@@ -71,6 +71,18 @@ def test_boundary_of_a_swing_is_that_of_its_energy():
     assert len(boundary.sweep) <= 2 * (9 + 2 * 9)
 
 
+def test_a_threshold_of_the_first_of_two_qualities_ends_the_rollout():
+    last = vtb.Quality(_angle, THETA, reading="end")
+    problem = _problem(quality=[vtb.Quality(_angle, THETA), last], threshold=1.0)
+    rollout = problem.rollout([8.0])
+    assert rollout.end == "threshold"
+    assert rollout.times[-1] == rollout.t_star < problem.task.horizon
+    # The other one is read up to this end, not to the horizon.
+    assert rollout.measures == (rollout.value,)
+    whole = _problem(quality=last, threshold=None).rollout([8.0])
+    assert whole.value != rollout.value
+
+
 def test_a_sweep_finds_the_best_and_stops_at_the_threshold():
     sweep = _problem().sweep(points=9, executor="serial", progress=False)
     speeds = sweep.points[:, 0]

@@ -147,7 +147,7 @@ class Problem:
             Pareto front.
         horizon: The horizon t_m in seconds.
         threshold: The threshold f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None:
-            never.
+            never. Of several qualities it is the first one's; the others are read up to this end.
         sample_period: Period of the samples of f, in seconds; part of the problem, see `RolloutTask`.
         conditions: Further elements of s0 (address -> value) that a decision must cope with, such as start phases,
             frictions or the seeds of sensors; every point runs under each, so that all points have the same noise
@@ -205,8 +205,6 @@ class Problem:
             start=start,
             motion=self._with_varied(motion),
         )
-        if self.task.threshold is not None and len(self.objectives) > 1:
-            raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
         self.scenario = self.task.scenario
         self.testbed: VirtualTestbed = self.scenario.build()
         if start is not None:

@@ -1,65 +1,100 @@
-"""Application O3: its problem, and what counts as robust."""
+"""Application O3: its problem, the captures that are kept, its stages, and what its answer claims."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from vtbdrake.rollout import SerialExecutor
+import vtbdrake as vtb
+from vtbdrake.rollout import RolloutResult
 from vtbdrake.state.systems import pose_to_array
+from vtbdrake_diagrams.kept_results import KeptResultsError
 from vtbdrake_diagrams.satellite.bodies import Target
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE
-from vtbdrake_diagrams.satellite.studies import lighting
 from vtbdrake_diagrams.satellite.studies.lighting import (
     ACCURACY,
+    BY_HAND,
     CANDIDATES,
-    CHECKED_ON,
-    CHOICE,
-    CHOSEN_ON,
-    DEFAULT,
     FAILURE,
+    JUDGED_ON,
+    LARGEST_ERROR,
     LIGHTS,
+    OTHER_LIGHTS,
     PARAMETERS,
-    RECORDED,
-    Captures,
+    RACE_BUDGET,
+    RACED_ON,
+    SCREENED_ON,
+    TODAY,
+    UNFINISHED,
+    Campaign,
+    Capture,
+    Case,
+    KeptCaptures,
     LightingAnswer,
     LightingScenario,
-    Settings,
+    Race,
+    Results,
+    Screening,
+    agree,
+    answer_lighting,
     bar_error,
-    capture_all,
+    error_at_grip,
     lighting_problem,
     plot_answer,
+    time_to_end,
     time_to_grip,
 )
 from vtbdrake_diagrams.satellite.supervisor import Mode
 
+HELD = Capture(18.0, 0.001)
+FAILED = Capture(FAILURE, LARGEST_ERROR)
+OTHER = tuple(1.1 * value for value in TODAY)
 
-def test_default_is_what_the_robot_does_by_itself() -> None:
-    problem = lighting_problem([0])
+
+# -- the problem
+
+
+def test_todays_constants_are_the_robots() -> None:
+    problem = lighting_problem(SCREENED_ON[:1])
     context = problem.testbed.default_context()
-    for parameter, value in zip(PARAMETERS, DEFAULT.entries(), strict=True):
+    for parameter, value in zip(PARAMETERS, TODAY, strict=True):
         if not parameter.is_field:
             assert problem.testbed.read(context, parameter.address) == pytest.approx(value)
-    assert LightingScenario().threshold == LightingScenario().evaluation.detector.threshold == DEFAULT.threshold
+    detector = LightingScenario().evaluation.detector
+    assert (detector.threshold, detector.min_width) == TODAY[-2:]
+    assert len(PARAMETERS) >= 8
+    assert all(p.lower < value < p.upper for p, value in zip(PARAMETERS, TODAY, strict=True))
 
 
-def test_choice_is_a_candidate_checked_on_other_starts() -> None:
-    assert CANDIDATES[0] == DEFAULT
-    assert CHOICE in CANDIDATES
-    assert not set(CHOSEN_ON) & set(CHECKED_ON)
+def test_fields_of_the_scenario_reach_the_detector() -> None:
+    dps = replace(LightingScenario(), threshold=3.0, min_width=6.0).make_dps()
+    detector = dps.GetSubsystemByName("env").GetSubsystemByName("markers").function.function.detector
+    assert (detector.threshold, detector.min_width) == (3.0, 6.0)
 
 
-def test_conditions_are_all_lights_from_all_starts() -> None:
-    problem = lighting_problem([0, 1, 2])
-    assert len(problem.conditions) == 3 * len(LIGHTS)
-    starts = {tuple(condition["sim.sys.target.body.pose"]) for condition in problem.conditions}
-    assert len(starts) == 3
+def test_starts_of_the_judgement_are_others() -> None:
+    assert set(SCREENED_ON) < set(RACED_ON)
+    assert len({case.seed for case in RACED_ON}) == 8
+    assert {case.light for case in SCREENED_ON} == set(LIGHTS)
+    assert len({case.seed for case in JUDGED_ON}) == 20
+    assert not {case.seed for case in JUDGED_ON} & {case.seed for case in RACED_ON}
+    assert {case.light for case in JUDGED_ON} == set(LIGHTS) | set(OTHER_LIGHTS)
 
 
-def test_only_a_held_bar_counts() -> None:
+def test_only_a_held_bar_has_a_time() -> None:
     assert [time_to_grip(mode, 12.5) for mode in (Mode.RETREAT, Mode.HOLD)] == [12.5, 12.5]
     assert [time_to_grip(mode, 12.5) for mode in (0.0, Mode.GRIP, Mode.ABORT)] == [FAILURE] * 3
+
+
+def test_rollout_ends_when_the_bar_is_held_or_the_capture_aborted() -> None:
+    threshold = lighting_problem(SCREENED_ON[:1]).task.threshold
+    assert threshold == UNFINISHED
+    assert time_to_end(Mode.RETREAT, 12.5) == 12.5
+    assert time_to_end(Mode.ABORT, 12.5) == FAILURE < threshold
+    assert [time_to_end(mode, 12.5) for mode in (Mode.WAIT, Mode.TRACK, Mode.GRIP)] == [threshold] * 3
 
 
 def test_bar_error_is_seen_from_the_base() -> None:
@@ -67,65 +102,200 @@ def test_bar_error_is_seen_from_the_base() -> None:
     X_BT = RigidTransform(RollPitchYaw(0.1, 0.2, -0.4), [2.5, 0.1, -0.2])
     relative = np.zeros(RELATIVE)
     relative[11:14] = X_BT @ Target().X_TH.translation() + [0.003, 0.0, -0.004]
-    values = pose_to_array(X_WB), pose_to_array(X_WB @ X_BT), relative
-    record = {address: [np.full_like(value, np.nan), value] for address, value in zip(RECORDED, values, strict=True)}
-    assert bar_error(record) == pytest.approx(0.005)
+    poses = pose_to_array(X_WB), pose_to_array(X_WB @ X_BT)
+    assert bar_error(*poses, relative) == pytest.approx(0.005)
+    assert error_at_grip(Mode.HOLD, *poses, relative) == pytest.approx(0.005)
+    assert error_at_grip(Mode.ABORT, *poses, relative) == LARGEST_ERROR
+
+
+# -- captures that are kept
+
+
+class Simulated:
+    """An executor whose captures take longer with a slower gripper, and fail with a high threshold in grazing light."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def run(self, task, points, *, start=None):
+        for index, point in enumerate(points):
+            self.count += 1
+            grazing = abs(point.get("sim.env.light.direction", [1.0])[0]) < 0.2
+            failed = grazing and point["scenario.threshold"] > 6.0
+            time = FAILURE if failed else 12.0 + 0.5 / point["dps.impl.controller.speed"]
+            measure, value = task.measures[0], LARGEST_ERROR if failed else 0.001
+            limit = measure.at_most if isinstance(measure, vtb.Constraint) else 0.0
+            sample = np.ones(1)
+            yield (
+                index,
+                RolloutResult(
+                    parameters=point,
+                    end="threshold",
+                    times=sample,
+                    quality=sample,
+                    value=time,
+                    measures=(value - limit,),
+                ),
+            )
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> Simulated:
+    simulated = Simulated()
+    monkeypatch.setattr("vtbdrake_diagrams.satellite.studies.lighting.SerialExecutor", lambda: simulated)
+    return simulated
+
+
+@pytest.mark.parametrize("two_qualities", [True, False])
+def test_kept_capture_is_not_simulated_again(simulated: Simulated, two_qualities: bool) -> None:
+    problem = lighting_problem(SCREENED_ON[:1], two_qualities=two_qualities)
+    point, captures = problem.values(TODAY, condition=0), {}
+    results = [next(KeptCaptures(captures, keep=list).run(problem.task, [point]))[1] for _ in range(2)]
+    assert simulated.count == 1
+    assert captures == {(TODAY, SCREENED_ON[0]): Capture(pytest.approx(12.0 + 0.5 / 0.12), pytest.approx(0.001))}
+    limit = 0.0 if two_qualities else LARGEST_ERROR
+    for result in results:
+        assert result.measures == (pytest.approx(0.001 - limit),)
+        assert result.value == pytest.approx(12.0 + 0.5 / 0.12)
+
+
+def test_capture_that_is_missing_is_named() -> None:
+    problem = lighting_problem(SCREENED_ON[:1])
+    with pytest.raises(KeptResultsError, match=r"start|seed=201.*threshold 7.*--full goes on"):
+        list(KeptCaptures({}).run(problem.task, [problem.values(TODAY, condition=0)]))
+
+
+def test_stages_find_the_candidate_that_never_fails(simulated: Simulated) -> None:
+    captures: dict = {}
+    answer = answer_lighting(captures, keep=lambda: None)
+    assert answer.screening.candidates[: len(BY_HAND)] == tuple(BY_HAND.values())
+    assert len(answer.screening.candidates) == CANDIDATES
+    threshold, speed = answer.choice[8], answer.choice[0]
+    assert threshold <= 6.0
+    # Among those that never fail, the fastest of the screening has won, or a faster one of the race.
+    sure = [values for values in answer.screening.candidates if values[8] <= 6.0]
+    assert speed >= max(values[0] for values in sure)
+    # Today's constants fail in the grazing sun, and were dropped.
+    assert not answer.race.exact[answer.race.candidates.index(TODAY)]
+    assert len(captures) <= CANDIDATES * len(SCREENED_ON) + RACE_BUDGET + 2 * len(JUDGED_ON)
+    assert len(answer.judged) == len(JUDGED_ON)
+    # The same again, from what is kept: nothing is simulated.
+    count = simulated.count
+    again = answer_lighting(captures)
+    assert simulated.count == count
+    assert again.choice == answer.choice
+
+
+def test_kept_captures_are_complete() -> None:
+    results = Results.read()
+    answer = results.answer()
+    assert len(answer.screening.candidates) == results.candidates >= CANDIDATES
+    assert answer.choice in answer.race.candidates
+    assert answer.judged == JUDGED_ON
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_choice_holds_the_bar_in_the_grazing_sun(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lighting, "LIGHTS", {"grazing, 86 deg": LIGHTS["grazing, 86 deg"]})
-    found = capture_all([CHOICE], seeds=[1], executor=SerialExecutor())
-    assert found.failures.tolist() == [[0]]
-    assert 5.0 < found.times.item() < 30.0
-    assert found.errors.item() < ACCURACY
+def test_kept_capture_comes_out_again() -> None:
+    captures = Results.read().captures
+    key = TODAY, next(case for case in SCREENED_ON if case.light.startswith("beside"))
+    problem, anew = lighting_problem([key[1]]), {}
+    list(KeptCaptures(anew, keep=lambda: None).run(problem.task, [problem.values(TODAY, condition=0)]))
+    assert agree(captures[key], anew[key])
 
 
-TRIED = (DEFAULT, Settings(closing_speed=0.09), Settings(gain=1.5))
-# Under four lights from two starts.
-COSTS = np.array(
-    [
-        [[10, 12], [15, 15], [30, 30], [20, 20]],
-        [[8, 8], [9, 9], [60, 30], [10, 10]],
-        [[9, 11], [14, 14], [28, 28], [19, 19]],
-    ],
-    dtype=float,
-)
+def test_captures_agree_within_a_sample() -> None:
+    assert agree(HELD, replace(HELD, time=18.2))
+    assert not agree(HELD, replace(HELD, time=18.6))
+    assert not agree(HELD, FAILED)
+    assert not agree(HELD, replace(HELD, error=0.0012))
 
 
-def _captures(costs: np.ndarray, error: float = 0.5 * ACCURACY) -> Captures:
-    return Captures(costs, np.where(costs < FAILURE, error, np.nan))
+# -- the answer
 
 
-def test_robust_choice_is_best_in_its_worst_light() -> None:
-    tried = _captures(COSTS)
-    assert tried.robust == 2
-    assert tried.failures[1].tolist() == [0, 0, 1, 0]
-    answer = LightingAnswer(TRIED[2], _captures(COSTS[[0, 2]]), TRIED, tried)
-    assert [TRIED.index(settings) for settings in answer.best.values()] == [1, 1, 2, 1]
+def _answer(today: dict[str, list[Capture]], choice: dict[str, list[Capture]]) -> LightingAnswer:
+    """Return an answer with these captures by light; all other lights have ones that hold the bar."""
+    captures = {(values, case): HELD for values in (TODAY, OTHER) for case in (*RACED_ON, *JUDGED_ON)}
+    for values, by_light in ((TODAY, today), (OTHER, choice)):
+        for light, results in by_light.items():
+            on = [case for case in JUDGED_ON if case.light == light]
+            captures |= {(values, case): result for case, result in zip(on, results, strict=False)}
+    costs = np.array([[18.0, 0.001], [18.0, 0.002]])
+    screening = Screening((TODAY, OTHER), costs, (TODAY, OTHER))
+    return LightingAnswer(captures, screening, Race((TODAY, OTHER), costs[:, 0], np.array([True, True]), OTHER))
+
+
+GRAZING = "grazing, 86 deg"
+FAILS = {light: [FAILED] * 3 for light in (GRAZING, "grazing from above, 82 deg")}
+
+
+def test_answer_holds_with_fewer_failures() -> None:
+    answer = _answer(FAILS, {})
     assert answer.holds
+    lower, mean, upper = answer.gain
+    assert mean == pytest.approx(6 * 42.0 / 20)
+    assert 0.0 < lower < mean < upper
+    assert answer.verdict.startswith("faster than today's constants: by 12.6 s")
 
 
-@pytest.mark.parametrize("worse", [[[9, 11], [16, 16], [28, 28], [19, 19]], [[9, 11], [14, 14], [30, 30], [19, 19]]])
-def test_choice_that_is_worse_in_a_light_does_not_hold(worse: list) -> None:
-    checked = _captures(np.array([COSTS[0], worse]))
-    assert not LightingAnswer(TRIED[2], checked).holds
+def test_answer_does_not_hold_without_a_gain() -> None:
+    answer = _answer({GRAZING: [FAILED]}, {GRAZING: [replace(HELD, time=17.0)] * 2})
+    assert answer.gain[0] < 0.0 < answer.gain[1]
+    assert list(answer.claims.values()) == [True, True, True, False]
+    assert "not shown" in answer.verdict
+    assert not answer.holds
+
+
+def test_answer_does_not_hold_if_another_light_fails_more() -> None:
+    answer = _answer(FAILS, {"behind, lamp": [FAILED]})
+    assert list(answer.claims.values()) == [True, False, True, True]
 
 
 def test_time_is_not_bought_with_accuracy() -> None:
-    errors = np.full(COSTS.shape, 0.5 * ACCURACY)
-    errors[2, 3] = 2.0 * ACCURACY
-    tried = Captures(COSTS, errors)
-    assert tried.accurate.tolist() == [True, True, False]
-    # The second loses a capture in the grazing sun, the third is not accurate in one light.
-    assert tried.robust == 0
-    assert not LightingAnswer(TRIED[2], Captures(COSTS[[0, 2]], errors[[0, 2]])).holds
-    assert _captures(COSTS, 2.0 * ACCURACY).robust == 2
+    answer = _answer(FAILS, {"eclipse, lamp": [replace(HELD, error=2.0 * ACCURACY)] * 4})
+    assert list(answer.claims.values()) == [True, True, False, True]
 
 
-def test_plot_has_both_comparisons() -> None:
-    checked = _captures(COSTS[[0, 2]])
-    both = plot_answer(LightingAnswer(TRIED[2], checked, TRIED, _captures(COSTS)))
-    assert [len(axes.get_legend().get_texts()) for axes in both.axes] == [3, 2]
-    assert len(plot_answer(LightingAnswer(TRIED[2], checked)).axes) == 1
+@pytest.mark.parametrize("lost", [list(JUDGED_ON[7:8]), [c for c in JUDGED_ON if c.light == "eclipse, lamp"]])
+def test_answer_does_not_hold_on_fewer_starts(lost: list[Case]) -> None:
+    answer = _answer(FAILS, {})
+    captures = {key: capture for key, capture in answer.captures.items() if key[1] not in lost}
+    fewer = replace(answer, captures=captures)
+    assert len(fewer.judged) == len(JUDGED_ON) - len(lost)
+    assert not next(iter(fewer.claims.values()))
+
+
+def test_choice_pays_for_lights_in_which_another_is_faster() -> None:
+    answer = _answer({}, {})
+    case = next(case for case in SCREENED_ON if case.light == GRAZING)
+    captures = {**answer.captures, (TODAY, case): replace(HELD, time=16.0)}
+    best = replace(answer, captures=captures).best_alone
+    assert best[GRAZING] == (TODAY, 16.0, 18.0)
+    assert all(time == now for light, (_, time, now) in best.items() if light != GRAZING)
+
+
+def test_sensitivities_find_what_decides(simulated: Simulated) -> None:
+    answer = answer_lighting({}, keep=lambda: None)
+    time = dict(zip([p.address for p in PARAMETERS], answer.sensitivities["time"], strict=True))
+    assert time["scenario.threshold"] > 0.0 > time["dps.impl.controller.speed"]
+    # Bonferroni, with ten parameters and six candidates: the 99.5 % quantile of Student's t is 4.6041 (tables).
+    assert answer.telling_correlation == pytest.approx(4.6041 / np.sqrt(4.0 + 4.6041**2), abs=1e-4)
+
+
+def test_finalists_are_the_fastest_but_todays() -> None:
+    costs = np.array([[10.0, 0.0], [30.0, 0.0], [20.0, 0.002], [20.0, 0.001]])
+    values = (TODAY, *((float(k),) * len(TODAY) for k in (1, 2, 3)))
+    assert Screening(values, costs, values[:1]).finalists == (values[3], values[2])
+
+
+def test_plot_has_all_three_stages() -> None:
+    front, sensitivities, judgement = plot_answer(_answer(FAILS, {})).axes
+    assert [text.get_text() for text in front.get_legend().get_texts()] == ["candidates", "front", "today", "choice"]
+    assert len(sensitivities.get_yticks()) == len(PARAMETERS)
+    assert judgement.get_title() == "judgement: 20 other starts"
+
+
+def test_campaign_without_a_keeper_simulates_nothing() -> None:
+    with pytest.raises(KeptResultsError):
+        Campaign({}).screen()
