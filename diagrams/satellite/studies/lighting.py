@@ -6,14 +6,16 @@ of its camera. The lights are conditions: the sun in front of the target, where 
 beside it; grazing its face; and behind it, where only a lamp on the camera helps. A candidate has two qualities: the
 time until the fingers hold the bar, and how far the bar then is from where it is perceived.
 
-The answer has three stages, and each capture of all of them is kept:
+The answer has four stages, and each capture of all of them is kept:
 
-* **Screening.** A study with both qualities over a Sobol design, each candidate in `SCREENED_ON`: every light once.
-  It gives the front, the sensitivities and the best for each light alone.
+* **Screening.** A study with both qualities, of candidates by hand and of a Sobol design, in `SCREENED_ON`: every light
+  once. It gives the front, and the best for each light alone.
 * **Race.** The best of the screening and the constants that the robot has today are compared in `RACED_ON`, eight
   starts with each light twice, by the mean of the worst quarter (`RISK`). The error of the bar has a bound there. A
   candidate that can no longer win is dropped; what is left of the budget goes to candidates of another design.
 * **Judgement.** The winner and today's constants, on `JUDGED_ON`: other starts, the same lights and two others.
+* **Sensitivities.** One parameter after the other at the upper end of its range, in `VARIED_ON`: twice to four times
+  today's constant, and nothing else.
 
 All of this was fixed before the first capture. ``python -m vtbdrake_diagrams.satellite.studies.lighting --full``
 simulates what is missing in ``lighting.json`` beside this module, and keeps each capture: it may be ended and
@@ -23,7 +25,7 @@ anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +37,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
-from scipy.stats import spearmanr
 from scipy.stats import t as student
 
 import vtbdrake as vtb
@@ -71,6 +72,12 @@ SAMPLE_PERIOD = 0.2
 """Sample period of the costs, in s."""
 TELLING = 0.5
 """The least difference of mean times that means anything, in s: the cost has a period of 0.2 s."""
+FASTER = "faster than"
+"""How the choice compares with today's constants if the interval of its gain is above 0."""
+AS_FAST = "as fast as"
+"""How it compares if that interval is within `TELLING` about 0: then the parameters do not matter."""
+TELLING_ERROR = 1e-3
+"""The least difference of errors that means anything, in m: today's constants are about as far off."""
 MODE = "dps.impl.supervisor.mode"
 RECORDED = ("sim.sys.servicer.base.pose", "sim.sys.target.body.pose", "dps.impl.relative.relative")
 """What the error of the bar is found from: the true poses, and a `Relative`."""
@@ -139,9 +146,11 @@ RACED_ON = cases(tuple(LIGHTS), SEEDS)
 """The cases of the race, with those of the screening: eight starts, each light twice."""
 JUDGED_ON = cases((*OTHER_LIGHTS, *LIGHTS), tuple(range(301, 321)))
 """The cases of the judgement: 20 other starts, three or four for each of the six lights."""
+VARIED_ON = SCREENED_ON[1:3]
+"""The cases of the sensitivities: the sun beside, and grazing."""
 RISK = vtb.CVaR(0.25)
 """The risk of the race: the mean of the worst quarter of its cases."""
-CANDIDATES = 6
+CANDIDATES = 5
 """The number of candidates of the screening, with `BY_HAND`, if the kept results have no other."""
 FINALISTS = 2
 """How many candidates of the screening race with today's constants."""
@@ -150,7 +159,7 @@ RACE_BUDGET = 3 * len(RACED_ON)
 RERUN = 4
 """How many captures the row simulates anew."""
 CONFIDENCE = 0.9
-"""Confidence of all intervals."""
+"""Confidence of the interval."""
 RESULTS = Path(__file__).with_suffix(".json")
 """The results that ``--full`` keeps."""
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.lighting --full"
@@ -175,6 +184,8 @@ LOWER_THRESHOLD: Values = (*TODAY[:8], 3.0, 9.0)
 """Today's constants with another threshold of the detector: the best of six candidates from one start, before."""
 LONGER_EXPOSURE: Values = (*TODAY[:7], 1.5, *TODAY[8:])
 """Today's constants with a longer exposure: the second of these."""
+VARIED: tuple[Values, ...] = tuple((*TODAY[:k], p.upper, *TODAY[k + 1 :]) for k, p in enumerate(PARAMETERS))
+"""Today's constants but for one parameter, which is at the upper end of its range, in the order of the parameters."""
 BY_HAND = {"today": TODAY, "threshold 3": LOWER_THRESHOLD, "exposure 1.5": LONGER_EXPOSURE}
 """The candidates by hand, first the baseline."""
 
@@ -477,9 +488,15 @@ class Campaign:
 
     def judge(self, choice: Values) -> None:
         """Simulate the captures of the judgement, with today's constants and the choice in turn."""
-        problem = lighting_problem(JUDGED_ON)
-        tried = dict.fromkeys((TODAY, choice))
-        points = [problem.values(values, condition=k) for k in range(len(JUDGED_ON)) for values in tried]
+        self._simulate(dict.fromkeys((TODAY, choice)), JUDGED_ON)
+
+    def vary(self) -> None:
+        """Simulate the captures of the sensitivities."""
+        self._simulate(VARIED, VARIED_ON)
+
+    def _simulate(self, candidates: Iterable[Values], on: Sequence[Case]) -> None:
+        problem = lighting_problem(on)
+        points = [problem.values(values, condition=k) for k in range(len(on)) for values in candidates]
         for _ in self._executor.run(problem.task, points):
             pass
 
@@ -529,6 +546,18 @@ class LightingAnswer:
         return mean - half, mean, mean + half
 
     @property
+    def comparison(self) -> str:
+        """Return in words how the choice compares with today's constants where it is judged, by its `gain`."""
+        if len(self.judged) < 2:
+            return "not judged yet"
+        lower, _, upper = self.gain
+        if lower > 0.0:
+            return FASTER
+        if -TELLING < lower and upper < TELLING:
+            return AS_FAST
+        return "slower than" if upper < 0.0 else "not shown to be faster, slower or as fast as"
+
+    @property
     def claims(self) -> dict[str, bool]:
         """Return what must be true of the judgement, with its truth."""
         lights = {case.light for case in self.judged}
@@ -540,7 +569,8 @@ class LightingAnswer:
                 sum(c.failed for c in now) <= sum(c.failed for c in before) for before, now in ends.values()
             ),
             f"the bar within {1e3 * ACCURACY:g} mm in the mean of every light": not any(e > ACCURACY for e in errors),
-            "faster than today, with confidence": len(self.judged) > 1 and self.gain[0] > 0.0,
+            f"faster than today, or as fast within {TELLING:g} s, with confidence": self.comparison
+            in (FASTER, AS_FAST),
         }
 
     @property
@@ -562,30 +592,33 @@ class LightingAnswer:
         return best
 
     @property
-    def sensitivities(self) -> dict[str, Array]:
-        """Return the rank correlation of each parameter with the costs of the screening, shape (parameters,) each.
+    def sensitivities(self) -> dict[str, dict[Case, Capture]]:
+        """Return the captures with one parameter at the upper end of its range, by address and case.
 
-        Of the time, failures included, and of the error of the captures that succeeded.
+        Those that were not simulated yet are missing.
         """
-        candidates = np.array(self.screening.candidates)
-        succeeded = [[c for c in self.of(v, SCREENED_ON) if not c.failed] for v in self.screening.candidates]
-        errors = np.array([mean_error(captures) for captures in succeeded])
-        costs = {"time": self.screening.costs[:, 0], "error": errors}
         return {
-            name: np.array([spearmanr(column[valid], values[valid]).statistic for column in candidates.T])
-            for name, values in costs.items()
-            if (valid := np.isfinite(values)).sum() > 2 and np.ptp(values[valid]) > 0.0
+            parameter.address: {
+                case: self.captures[values, case] for case in VARIED_ON if (values, case) in self.captures
+            }
+            for parameter, values in zip(PARAMETERS, VARIED, strict=True)
         }
 
     @property
-    def telling_correlation(self) -> float:
-        """Return the correlation beyond which a parameter has an effect, with `CONFIDENCE` for all of them together.
+    def telling(self) -> dict[str, bool]:
+        """Return by address whether a parameter matters: whether its captures come out differently from today's.
 
-        By Student's t and Bonferroni's correction for the number of parameters.
+        Later or earlier by more than `TELLING`, or with an error that differs by more than `TELLING_ERROR`.
         """
-        freedom = len(self.screening.candidates) - 2
-        quantile = float(student.ppf(1.0 - (1.0 - CONFIDENCE) / (2.0 * len(PARAMETERS)), freedom))
-        return quantile / float(np.sqrt(freedom + quantile**2))
+        return {
+            address: any(
+                abs(capture.time - self.captures[TODAY, case].time) > TELLING
+                or abs(capture.error - self.captures[TODAY, case].error) > TELLING_ERROR
+                for case, capture in captures.items()
+            )
+            for address, captures in self.sensitivities.items()
+            if len(captures) == len(VARIED_ON)
+        }
 
     @property
     def verdict(self) -> str:
@@ -593,10 +626,9 @@ class LightingAnswer:
         if self.choice == TODAY:
             return "no candidate is better than today's constants"
         if len(self.judged) < 2:
-            return "not judged yet"
+            return self.comparison
         lower, mean, upper = self.gain
-        worth = "faster" if lower > 0.0 else "slower" if upper < 0.0 else "not shown to be faster or slower"
-        return f"{worth} than today's constants: by {mean:.1f} s [{lower:.1f}, {upper:.1f}] in the mean"
+        return f"{self.comparison} today's constants: {mean:.2f} s [{lower:.2f}, {upper:.2f}] faster in the mean"
 
 
 def mean_error(captures: Sequence[Capture]) -> float:
@@ -617,7 +649,7 @@ def answer_lighting(
     Args:
         captures: The captures so far; new ones are added.
         candidates: The number of candidates of the screening.
-        keep: Is called after each new capture; None: nothing is simulated, and the judgement may be incomplete.
+        keep: Is called after each new capture; None: nothing is simulated, and the last two stages may be incomplete.
         echo: Gets a line for each new capture.
 
     Raises:
@@ -628,6 +660,7 @@ def answer_lighting(
     race = campaign.race(screening)
     if keep is not None:
         campaign.judge(race.choice)
+        campaign.vary()
     return LightingAnswer(captures, screening, race)
 
 
@@ -738,14 +771,19 @@ def _draw_front(axes: Axes, answer: LightingAnswer) -> None:
 
 
 def _draw_sensitivities(axes: Axes, answer: LightingAnswer) -> None:
-    rows = np.arange(len(PARAMETERS))
-    for offset, (name, values) in zip((-0.2, 0.2), answer.sensitivities.items(), strict=False):
-        axes.barh(rows + offset, values, 0.36, label=name)
-    for limit in (-answer.telling_correlation, answer.telling_correlation):
+    rows, width = np.arange(len(PARAMETERS)), 0.8 / len(VARIED_ON)
+    for number, case in enumerate(VARIED_ON):
+        before = answer.captures[TODAY, case].time
+        changes = [
+            captures[case].time - before if case in captures else 0.0 for captures in answer.sensitivities.values()
+        ]
+        axes.barh(rows + (number - 0.5) * width, changes, width, label=f"{case.light}, from {before:.1f} s")
+    for limit in (-TELLING, TELLING):
         axes.axvline(limit, color="black", ls=":", lw=1.0)
-    axes.set_yticks(rows, [short(parameter) for parameter in PARAMETERS], fontsize="x-small")
-    axes.set(xlabel="rank correlation with the cost", xlim=(-1.0, 1.0), ylim=(len(rows) - 0.5, -0.5))
-    axes.set_title(f"sensitivities; beyond the dots with {CONFIDENCE:.0%} confidence", fontsize="small")
+    labels = [f"{short(p)} {today:g} to {p.upper:g}" for p, today in zip(PARAMETERS, TODAY, strict=True)]
+    axes.set_yticks(rows, labels, fontsize="x-small")
+    axes.set(xlabel="later by [s]", ylim=(len(rows) - 0.5, -0.5))
+    axes.set_title("one parameter at the upper end of its range", fontsize="small")
     axes.legend(fontsize="x-small")
 
 
@@ -812,14 +850,21 @@ def lighting(full: bool) -> Answer:
 
 
 def _sensitive(answer: LightingAnswer) -> str:
-    """Return in words which parameters matter, and the largest correlations."""
-    parts = []
-    for cost, values in answer.sensitivities.items():
-        order = np.argsort(-np.abs(values))
-        telling = [short(PARAMETERS[k]) for k in order if abs(values[k]) > answer.telling_correlation]
-        strongest = ", ".join(f"{short(PARAMETERS[k])} {values[k]:+.2f}" for k in order[:3])
-        parts.append(f"{cost}: {', '.join(telling) or 'none for sure'} (strongest: {strongest})")
-    return f"Parameters that matter, beyond a rank correlation of {answer.telling_correlation:.2f}: {'; '.join(parts)}."
+    """Return in words which parameters matter, and how much."""
+    if not answer.telling:
+        return "Sensitivities: not simulated yet."
+    words = [
+        f"{short(p)} at {p.upper:g}: "
+        + ", ".join(
+            f"{case.light} "
+            + ("failed" if c.failed else f"{c.time - answer.captures[TODAY, case].time:+.1f} s, {1e3 * c.error:.1f} mm")
+            for case, c in answer.sensitivities[p.address].items()
+        )
+        for p in PARAMETERS
+        if answer.telling.get(p.address)
+    ]
+    rest = [short(p) for p in PARAMETERS if not answer.telling.get(p.address, True)]
+    return f"One parameter alone matters: {'; '.join(words) or 'none'}; not: {', '.join(rest) or 'none'}."
 
 
 @click.command()
