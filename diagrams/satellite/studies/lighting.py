@@ -553,7 +553,7 @@ class LightingAnswer:
         lower, _, upper = self.gain
         if lower > 0.0:
             return FASTER
-        if -TELLING < lower and upper < TELLING:
+        if lower > -TELLING and upper < TELLING:
             return AS_FAST
         return "slower than" if upper < 0.0 else "not shown to be faster, slower or as fast as"
 
