@@ -73,7 +73,7 @@ SAMPLE_PERIOD = 0.2
 TELLING = 0.5
 """The least difference of mean times that means anything, in s: the cost has a period of 0.2 s."""
 FASTER = "faster than"
-"""How the choice compares with today's constants if the interval of its gain is above 0."""
+"""How the choice compares with today's constants if the interval of its gain is above 0, and reaches `TELLING`."""
 AS_FAST = "as fast as"
 """How it compares if that interval is within `TELLING` about 0: then the parameters do not matter."""
 TELLING_ERROR = 1e-3
@@ -156,7 +156,7 @@ FINALISTS = 2
 """How many candidates of the screening race with today's constants."""
 RACE_BUDGET = 3 * len(RACED_ON)
 """The number of captures that the race may take, with those of the screening."""
-RERUN = 4
+RERUN = 3
 """How many captures the row simulates anew."""
 CONFIDENCE = 0.9
 """Confidence of the interval."""
@@ -551,10 +551,10 @@ class LightingAnswer:
         if len(self.judged) < 2:
             return "not judged yet"
         lower, _, upper = self.gain
-        if lower > 0.0:
-            return FASTER
         if lower > -TELLING and upper < TELLING:
             return AS_FAST
+        if lower > 0.0:
+            return FASTER
         return "slower than" if upper < 0.0 else "not shown to be faster, slower or as fast as"
 
     @property
@@ -743,13 +743,11 @@ def names(answer: LightingAnswer) -> dict[str, Values]:
 
 
 def plot_answer(answer: LightingAnswer) -> Figure:
-    """Draw the front of the screening, the sensitivities, and the judgement under each light."""
-    figure = Picture(15.0, 4.6)
-    left, middle, right = figure.subplots(1, 3, width_ratios=[1.0, 1.0, 1.2])
-    _draw_front(left, answer)
-    _draw_sensitivities(middle, answer)
-    _draw_judgement(right, answer)
-    for axes in (left, middle, right):
+    """Draw the front of the screening, the judgement under each light, and the sensitivities if there are any."""
+    pictures = [_draw_front, _draw_judgement, *([_draw_sensitivities] if answer.telling else [])]
+    figure = Picture(5.0 * len(pictures), 4.6)
+    for axes, draw in zip(figure.subplots(1, len(pictures)), pictures, strict=True):
+        draw(axes, answer)
         finish(axes)
     return figure
 

@@ -29,6 +29,8 @@ from vtbdrake_diagrams.satellite.studies.lighting import (
     SCREENED_ON,
     TODAY,
     UNFINISHED,
+    VARIED,
+    VARIED_ON,
     Campaign,
     Capture,
     Case,
@@ -306,11 +308,18 @@ def test_finalists_are_the_fastest_but_todays() -> None:
     assert Screening(values, costs, values[:1]).finalists == (values[3], values[2])
 
 
-def test_plot_has_all_three_stages() -> None:
-    front, sensitivities, judgement = plot_answer(_answer(FAILS, {})).axes
+def test_plot_shows_sensitivities_once_there_are_any() -> None:
+    answer = _answer(FAILS, {})
+    front, judgement = plot_answer(answer).axes
     assert [text.get_text() for text in front.get_legend().get_texts()] == ["candidates", "front", "today", "choice"]
-    assert len(sensitivities.get_yticks()) == len(PARAMETERS)
     assert judgement.get_title() == "judgement: 20 other starts"
+    later = {(VARIED[3], case): replace(HELD, time=20.0) for case in VARIED_ON}
+    varied = replace(answer, captures={**answer.captures, **later})
+    assert varied.telling == {PARAMETERS[3].address: True}
+    bars = plot_answer(varied).axes[2].containers
+    assert [[bar.get_width() for bar in bars_of_case] for bars_of_case in bars] == [
+        [2.0 if k == 3 else 0.0 for k in range(len(PARAMETERS))]
+    ] * 2
 
 
 def test_campaign_without_a_keeper_simulates_nothing() -> None:
