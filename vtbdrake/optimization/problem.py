@@ -147,7 +147,7 @@ class Problem:
             Pareto front.
         horizon: The horizon t_m in seconds.
         threshold: The threshold f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None:
-            never. Of several qualities it is the first one's; the others are read up to this end.
+            never. With several qualities it belongs to the first; the others are read up to the end of the rollout.
         sample_period: Period of the samples of f, in seconds; part of the problem, see `RolloutTask`.
         conditions: Further elements of s0 (address -> value) that a decision must cope with, such as start phases,
             frictions or the seeds of sensors; every point runs under each, so that all points have the same noise

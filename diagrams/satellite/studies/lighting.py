@@ -41,6 +41,7 @@ from scipy.stats import t as student
 
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
+from vtbdrake.optimization import Risk
 from vtbdrake.rollout import Executor, RolloutResult, RolloutRunner, RolloutTask, SerialExecutor
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.start import Starts
@@ -143,7 +144,7 @@ SEEDS = tuple(range(201, 209))
 SCREENED_ON = cases(tuple(LIGHTS), SEEDS[:4])
 """The cases of the screening: four starts, a light each."""
 RACED_ON = cases(tuple(LIGHTS), SEEDS)
-"""The cases of the race, with those of the screening: eight starts, each light twice."""
+"""The cases of the race, the screening's included: eight starts, each light twice."""
 JUDGED_ON = cases((*OTHER_LIGHTS, *LIGHTS), tuple(range(301, 321)))
 """The cases of the judgement: 20 other starts, three or four for each of the six lights."""
 VARIED_ON = SCREENED_ON[1:3]
@@ -155,7 +156,7 @@ CANDIDATES = 5
 FINALISTS = 2
 """How many candidates of the screening race with today's constants."""
 RACE_BUDGET = 3 * len(RACED_ON)
-"""The number of captures that the race may take, with those of the screening."""
+"""The number of captures that the race may take, the screening's included."""
 RERUN = 3
 """How many captures the row simulates anew."""
 CONFIDENCE = 0.9
@@ -246,7 +247,7 @@ _BOUND = vtb.Constraint(error_at_grip, of=[MODE, *RECORDED], reading="end", at_m
 
 
 def lighting_problem(
-    on: Sequence[Case] = RACED_ON, *, two_qualities: bool = False, risk: str | vtb.Risk = RISK
+    on: Sequence[Case] = RACED_ON, *, two_qualities: bool = False, risk: str | Risk = RISK
 ) -> vtb.Problem:
     """State the question. A rollout ends when the bar is held or the capture is aborted.
 
@@ -537,7 +538,7 @@ class LightingAnswer:
     def gain(self) -> tuple[float, float, float]:
         """Return by how much the choice is faster than today's constants where it is judged: (lower, mean, upper) in s.
 
-        A failure costs `FAILURE`. The interval is that of Student for pairs, with `CONFIDENCE`.
+        A failure costs `FAILURE`. The interval is Student's for pairs, with `CONFIDENCE`.
         """
         costs = np.array([[min(c.time, FAILURE) for c in self.of(v, self.judged)] for v in (TODAY, self.choice)])
         gains = costs[0] - costs[1]
@@ -761,8 +762,9 @@ def _draw_front(axes: Axes, answer: LightingAnswer) -> None:
     for number, (name, values) in enumerate(names(answer).items()):
         if values in screening.candidates:
             k = screening.candidates.index(values)
-            marker = {"marker": "*", "ms": 14.0, "color": BEST} if name == "choice" else {"marker": "s", "ms": 7.0}
-            axes.plot(time[k], error[k], ls="", label=name, **{"color": f"C{number}", **marker})
+            is_choice = name == "choice"
+            color, marker, size = (BEST, "*", 14.0) if is_choice else (f"C{number}", "s", 7.0)
+            axes.plot(time[k], error[k], marker, color=color, ms=size, label=name)
     axes.set(xlabel="mean time to grip, 60 s for a failure [s]", ylabel="mean error of the bar [mm]")
     axes.set_title(f"screening: {len(screening.candidates)} candidates, each light once", fontsize="small")
     axes.legend(fontsize="x-small")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 import vtbdrake as vtb
-from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout import RolloutResult, RolloutTask
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.kept_results import KeptResultsError
 from vtbdrake_diagrams.satellite.bodies import Target
@@ -35,6 +37,7 @@ from vtbdrake_diagrams.satellite.studies.lighting import (
     Capture,
     Case,
     KeptCaptures,
+    Key,
     LightingAnswer,
     LightingScenario,
     Race,
@@ -119,7 +122,9 @@ class Simulated:
     def __init__(self) -> None:
         self.count = 0
 
-    def run(self, task, points, *, start=None):
+    def run(
+        self, task: RolloutTask, points: Sequence[Mapping[str, Any]], *, start: Any = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
         for index, point in enumerate(points):
             self.count += 1
             grazing = abs(point.get("sim.env.light.direction", [1.0])[0]) < 0.2
@@ -151,13 +156,16 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> Simulated:
 @pytest.mark.parametrize("two_qualities", [True, False])
 def test_kept_capture_is_not_simulated_again(simulated: Simulated, two_qualities: bool) -> None:
     problem = lighting_problem(SCREENED_ON[:1], two_qualities=two_qualities)
-    point, captures = problem.values(TODAY, condition=0), {}
+    point = problem.values(TODAY, condition=0)
+    captures: dict[Key, Capture] = {}
     results = [next(KeptCaptures(captures, keep=list).run(problem.task, [point]))[1] for _ in range(2)]
     assert simulated.count == 1
-    assert captures == {(TODAY, SCREENED_ON[0]): Capture(pytest.approx(12.0 + 0.5 / 0.12), pytest.approx(0.001))}
+    ((key, capture),) = captures.items()
+    assert key == (TODAY, SCREENED_ON[0])
+    assert (capture.time, capture.error) == pytest.approx((12.0 + 0.5 / 0.12, 0.001))
     limit = 0.0 if two_qualities else LARGEST_ERROR
     for result in results:
-        assert result.measures == (pytest.approx(0.001 - limit),)
+        assert result.measures == pytest.approx((0.001 - limit,))
         assert result.value == pytest.approx(12.0 + 0.5 / 0.12)
 
 
@@ -168,7 +176,7 @@ def test_capture_that_is_missing_is_named() -> None:
 
 
 def test_stages_find_the_candidate_that_never_fails(simulated: Simulated) -> None:
-    captures: dict = {}
+    captures: dict[Key, Capture] = {}
     answer = answer_lighting(captures, keep=lambda: None)
     assert answer.screening.candidates[: len(BY_HAND)] == tuple(BY_HAND.values())
     assert len(answer.screening.candidates) == CANDIDATES
@@ -203,7 +211,8 @@ def test_kept_captures_are_complete() -> None:
 def test_kept_capture_comes_out_again() -> None:
     captures = Results.read().captures
     key = TODAY, next(case for case in SCREENED_ON if case.light.startswith("beside"))
-    problem, anew = lighting_problem([key[1]]), {}
+    problem = lighting_problem([key[1]])
+    anew: dict[Key, Capture] = {}
     list(KeptCaptures(anew, keep=lambda: None).run(problem.task, [problem.values(TODAY, condition=0)]))
     assert agree(captures[key], anew[key])
 
@@ -311,7 +320,9 @@ def test_finalists_are_the_fastest_but_todays() -> None:
 def test_plot_shows_sensitivities_once_there_are_any() -> None:
     answer = _answer(FAILS, {})
     front, judgement = plot_answer(answer).axes
-    assert [text.get_text() for text in front.get_legend().get_texts()] == ["candidates", "front", "today", "choice"]
+    legend = front.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["candidates", "front", "today", "choice"]
     assert judgement.get_title() == "judgement: 20 other starts"
     later = {(VARIED[3], case): replace(HELD, time=20.0) for case in VARIED_ON}
     varied = replace(answer, captures={**answer.captures, **later})
