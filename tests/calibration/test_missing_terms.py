@@ -44,6 +44,18 @@ def test_wrong_law_is_named(law: str, dependence: str) -> None:
     assert reason.startswith(f"the torque of pivot depends on {dependence}")
 
 
+def test_wrong_law_that_is_not_named_widens_the_intervals() -> None:
+    """With the sandwich estimator alone, both numbers of the friction lie 3 deviations from the truth."""
+    result = calibrated(recorded("Stribeck", seed=24))
+    assert result.accepted, result
+    for address, value in VALUES.items():
+        each = result.parameters[address]
+        assert each.lower < value < each.upper, each
+    # The samples are as wide.
+    friction = [sample[COULOMB] for sample in result.scenario.samples(200)]
+    assert np.std(friction) == pytest.approx(result.parameters[COULOMB].deviation, rel=0.2)
+
+
 @pytest.mark.parametrize(
     ("law", "term", "truth"),
     [("load", "load_friction", 0.1), pytest.param("direction", "asymmetry", 0.06, marks=pytest.mark.slow)],

@@ -21,7 +21,7 @@ from vtbdrake.calibration.fit_curves import FitCurves
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques, currents
-from vtbdrake.calibration.missing_terms import lost_friction, missing_terms
+from vtbdrake.calibration.missing_terms import lost_friction, missing_terms, named_terms, widening
 from vtbdrake.calibration.posterior import sandwich_covariance, torque_disturbances
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
@@ -79,7 +79,8 @@ class Calibrated:
         address: Its address.
         start: Its value in the scenario.
         value: Its estimate.
-        deviation: Its standard deviation, by the sandwich estimator over blocks of 0.2 s.
+        deviation: Its standard deviation, by the sandwich estimator over blocks of 0.2 s. If the model explains the
+            recordings, it is widened by what a term would change that the model may still lack.
         lower, upper: Its interval of 95 %, within its range. At a bound it is the profile of the likelihood, one-sided.
         verdict: Whether it may be used.
     """
@@ -523,9 +524,11 @@ def _result(
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
     deviations = np.sqrt(np.diag(sandwich)) * model.scales
     reasons += lost_friction(segments, prepared.start, z, noise, deviations)
-    reasons += map(str, missing_terms(segments, linearized, noise, z, used, info))
+    terms = missing_terms(segments, linearized, noise, z, used, info)
+    reasons += map(str, named_terms(terms))
     reasons += prepared.causes() if reasons else []
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
+    sandwich = sandwich if reasons else sandwich + widening(terms)
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
         verdict = Verdict.NO_EVIDENCE
         reasons.append("the start explains the segments that were kept back as well: nothing speaks for other values")

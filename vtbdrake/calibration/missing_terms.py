@@ -4,11 +4,14 @@ A disturbance of the torques is part of the filter, and it takes what the fricti
 stay white, and segments that were kept back fit as well. So terms that the model could have are tried one by one, at
 their value zero, beside all parameters that were fitted (a score test; C. R. Rao, Proc. Cambridge Philos. Soc. 44,
 1948): the estimate of a term is one step of Gauss and Newton, its deviation comes from the sandwich estimator.
+
+A term may be too small, or too uncertain, to be named, and still move the fitted parameters by some of their
+deviations. So the most significant one of each joint widens their intervals by what it would change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +24,9 @@ from vtbdrake.common.arrays import Array
 
 # A term is missed if it is at least this number of deviations from zero.
 SIGNIFICANT = 6.0
+# A term that is this number of deviations from zero widens the intervals of the fitted parameters: of a dozen terms
+# that are tried, chance alone seldom brings one that far.
+SUSPECTED = 3.0
 # Torques below this share of a joint's friction, or its torques if it has no friction, are left to the disturbance.
 SHARE_OF_FRICTION = 0.15
 # The smallest offset of an encoder that is named, in rad or m.
@@ -50,16 +56,36 @@ class MissingTerm:
         size: Root mean square of the torque in N m or N, or the offset in rad or m.
         deviation: Standard deviation of ``size``.
         share: The share of the joint's friction that the torque is; NaN of an offset.
+        significance: The estimate of the term over its deviation.
+        shift: What the scaled parameters would change by with the term, (nz,).
     """
 
     joint: str
     dependence: str
     size: float
     deviation: float
-    share: float = float("nan")
+    share: float
+    significance: float
+    shift: Array
+
+    @property
+    def is_offset(self) -> bool:
+        """Return whether it is the offset of an encoder."""
+        return bool(np.isnan(self.share))
+
+    @property
+    def is_named(self) -> bool:
+        """Return whether the term is large and sure enough that the model is discrepant without it."""
+        large = self.size > LEAST_OFFSET if self.is_offset else self.share > SHARE_OF_FRICTION
+        return large and self.significance > SIGNIFICANT
+
+    @property
+    def rank(self) -> float:
+        """Return its significance, larger for a simpler cause."""
+        return self.significance * (_SIMPLER if self.is_offset else 1.0)
 
     def __str__(self) -> str:
-        if np.isnan(self.share):
+        if self.is_offset:
             return (
                 f"the encoder of {self.joint} seems to be off by {self.size:.3g} +- {self.deviation:.2g} rad (or m), "
                 "which the model does not have"
@@ -103,7 +129,7 @@ def lost_friction(segments: Segments, start: Array, z: Array, noise: Noise, devi
 def missing_terms(
     segments: Segments, linearized: Linearization, noise: Noise, z: Array, used: NDArray[np.bool], info: Information
 ) -> list[MissingTerm]:
-    """Return the most significant term of each joint that the model lacks at its estimate.
+    """Return the terms that the fitted model may lack at its estimate: those that are suspected, the surest ones first.
 
     Args:
         segments: The recordings, with their filtered trajectories.
@@ -125,7 +151,7 @@ def missing_terms(
     distinct = tried - (fitted * info.scales) @ shared
     power, whole = (distinct**2).sum(axis=(0, 1, 2)), (G**2).sum(axis=0)
     gradients = np.einsum("twij,twi->j", distinct, white)
-    ranked: dict[str, tuple[float, MissingTerm]] = {}
+    suspected = []
     for k, (joint, dependence, rms, friction, _) in enumerate(terms):
         if power[k] <= _OWN * whole[k]:
             continue
@@ -133,15 +159,34 @@ def missing_terms(
         # Scores without the term come from a wrong model.
         scores = block_scores(distinct[..., [k]], white + value * distinct[..., k], segments.period)
         deviation = max(np.sqrt((scores**2).sum()), _LEAST_DEVIATION * np.sqrt(power[k])) / power[k]
-        is_offset = np.isnan(friction)
-        size = abs(value) * rms
-        large = size > (LEAST_OFFSET if is_offset else SHARE_OF_FRICTION * friction)
-        significance = abs(value) / deviation
-        rank = significance * (_SIMPLER if is_offset else 1.0)
-        if large and significance > SIGNIFICANT and rank > ranked.get(joint, (0.0,))[0]:
-            share = float("nan") if is_offset else size / friction
-            ranked[joint] = rank, MissingTerm(joint, dependence, float(size), float(deviation * rms), share)
-    return [term for _, term in ranked.values()]
+        size, significance = abs(value) * rms, abs(value) / deviation
+        share = size / friction
+        shift = -value * shared[:, k]
+        if significance > SUSPECTED:
+            term = MissingTerm(
+                joint, dependence, float(size), float(deviation * rms), float(share), float(significance), shift
+            )
+            suspected.append(term)
+    return sorted(suspected, key=lambda term: -term.rank)
+
+
+def named_terms(terms: Sequence[MissingTerm]) -> list[MissingTerm]:
+    """Return the surest term of each joint without which the model is discrepant.
+
+    Args:
+        terms: The suspected terms, the surest ones first.
+    """
+    return list({term.joint: term for term in reversed(terms) if term.is_named}.values())[::-1]
+
+
+def widening(terms: Sequence[MissingTerm]) -> Array | float:
+    """Return the covariance of the scaled parameters by the surest suspected term of each joint, (nz, nz).
+
+    Args:
+        terms: The suspected terms, the surest ones first; without any, it is 0.
+    """
+    surest = {term.joint: term for term in reversed(terms)}
+    return sum((np.outer(term.shift, term.shift) for term in surest.values()), 0.0)
 
 
 def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[tuple[str, str, float, float, Array]]:
