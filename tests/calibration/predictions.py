@@ -67,7 +67,7 @@ def trial(law: str, disturbance: float, offset: float, seed: int) -> Trial:
         seed: Seed of the motion of the fit; `HELD_OUT` is added for the other one.
     """
     law = law if law in LAWS else "Coulomb"
-    result = calibrated(moved(law, seed=seed, disturbance=disturbance).log(offset=offset))
+    result = calibrated(moved(law, seed=seed, disturbance=disturbance).log(offset=offset), segment=1.0)
     motion = moved(law, seed=seed + HELD_OUT, disturbance=disturbance)
     truth = np.array([motion.positions[rows_of(motion, start)] for start in STARTS])
     inside = []
