@@ -24,7 +24,7 @@ from vtbdrake_diagrams.quadruped import QuadrupedScenario
 from vtbdrake_diagrams.recorded_arms.pendulum import TorqueLimitedPendulumScenario
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
-from vtbdrake_diagrams.satellite.studies.lighting import LightingScenario
+from vtbdrake_diagrams.satellite.studies.light_cases import LightingScenario
 from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
 from vtbdrake_diagrams.station import HOME, ArmStation

@@ -51,7 +51,7 @@ from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.perception import target_board
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
-from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, guided_grips
+from vtbdrake_diagrams.satellite.studies.grips import FAILURE, guided_grips
 
 POSE = "sim.sense.docking_camera.pose"
 _ENTRIES = NamedVector(

@@ -53,7 +53,7 @@ from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_scan_pa
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target, plant_config
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import Release, Start, random_start
-from vtbdrake_diagrams.satellite.studies.lighting import FAILURE, guided_grips
+from vtbdrake_diagrams.satellite.studies.grips import FAILURE, guided_grips
 
 APPROACH = 16.0
 """How long the approach takes, in s."""

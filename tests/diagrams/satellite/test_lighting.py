@@ -16,42 +16,32 @@ from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.kept_results import KeptResultsError
 from vtbdrake_diagrams.satellite.bodies import Target
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE
-from vtbdrake_diagrams.satellite.studies.lighting import (
-    ACCURACY,
+from vtbdrake_diagrams.satellite.studies.grips import FAILURE, bar_error, time_to_grip
+from vtbdrake_diagrams.satellite.studies.light_answer import ACCURACY, LightingAnswer
+from vtbdrake_diagrams.satellite.studies.light_campaign import RACE_BUDGET, Campaign, Race, Screening
+from vtbdrake_diagrams.satellite.studies.light_captures import Capture, KeptCaptures, Key, Results, agree
+from vtbdrake_diagrams.satellite.studies.light_cases import (
     BY_HAND,
     CANDIDATES,
-    FAILURE,
     JUDGED_ON,
     LARGEST_ERROR,
     LIGHTS,
     OTHER_LIGHTS,
     PARAMETERS,
-    RACE_BUDGET,
     RACED_ON,
     SCREENED_ON,
     TODAY,
     UNFINISHED,
     VARIED,
     VARIED_ON,
-    Campaign,
-    Capture,
     Case,
-    KeptCaptures,
-    Key,
-    LightingAnswer,
     LightingScenario,
-    Race,
-    Results,
-    Screening,
-    agree,
-    answer_lighting,
-    bar_error,
     error_at_grip,
     lighting_problem,
-    plot_answer,
     time_to_end,
-    time_to_grip,
 )
+from vtbdrake_diagrams.satellite.studies.light_plots import plot_answer
+from vtbdrake_diagrams.satellite.studies.lighting import answer_lighting
 from vtbdrake_diagrams.satellite.supervisor import Mode
 
 HELD = Capture(18.0, 0.001)
@@ -149,7 +139,7 @@ class Simulated:
 @pytest.fixture
 def simulated(monkeypatch: pytest.MonkeyPatch) -> Simulated:
     simulated = Simulated()
-    monkeypatch.setattr("vtbdrake_diagrams.satellite.studies.lighting.SerialExecutor", lambda: simulated)
+    monkeypatch.setattr("vtbdrake_diagrams.satellite.studies.light_captures.SerialExecutor", lambda: simulated)
     return simulated
 
 
@@ -200,7 +190,7 @@ def test_stages_find_the_candidate_that_never_fails(simulated: Simulated) -> Non
 
 def test_kept_captures_are_complete() -> None:
     results = Results.read()
-    answer = results.answer()
+    answer = answer_lighting(results.captures, candidates=results.candidates)
     assert len(answer.screening.candidates) == results.candidates >= CANDIDATES
     assert answer.choice in answer.race.candidates
     assert answer.judged == JUDGED_ON
