@@ -40,9 +40,9 @@ int JACOBIAN(const double **arg, double **res, long long int *iw, double *w, int
     static const int sizes[ARGUMENTS] = {NV * NV, NV, NV, 0, 0, 0, 0, 0, 0, NS, ND, ND};
     static const int rows[4] = {NV, 0, ND, 1};
     Problem p;
-    double v[NV], grad[NV], H[NV][NV], slope;
+    double v[NV], H[NV][NV], slope;
     take_step(arg, &p, v);
-    gradient(&p, v, grad, H);
+    hessian(&p, v, H);
     int works = factor(H, p.ways);
     for (int o = 0; o < 4; ++o) {
         double **block = res + ARGUMENTS * o;
