@@ -83,5 +83,5 @@ def check_runs(name: str, *, shorter: Mapping[str, str]) -> None:
         assert not warnings, f"{cell.id} warns: {warnings}"
         if "Scene in 3D" in str(cell.outputs):  # It has a picture where the machine can render.
             continue
-        expected = any(word in cell.source for word in ("plot()", "plot_", "plt.show()"))
+        expected = any(word in cell.source for word in ("plot()", "plot_", "plt.show()", "display(draw("))
         assert pictures(cell) == pictures(before[cell.id]) == expected, cell.id
