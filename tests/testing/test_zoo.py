@@ -61,7 +61,7 @@ MESSAGES = {
     "check_fork_is_the_future": "simulated from a copy at 0.15 s",
     "check_snapshot_resumes": "simulated from a snapshot at 0.15 s",
     "check_dropped_testbed_is_freed": "1 DiscreteTimeIntegrator",
-    "check_runs_keep_no_memory": "leaves 30 objects of Python behind",
+    "check_runs_keep_no_memory": "objects of Python behind: something outside of the Context keeps them",
     "check_sim_and_real_alike": "position measures [0.03984], but [0.0398] arrives",
     "check_dps_cannot_tell_the_switch": "[0.1] instead of [0.2]",
     "check_dps_alone_commands_the_same": "[0.8] instead of [0.801]",

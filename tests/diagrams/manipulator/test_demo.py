@@ -67,7 +67,7 @@ class Pusher(Attendant):
 
 
 @pytest.mark.slow
-def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(capsys):
+def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(capsys, caplog):
     with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
         demo = Demo(LAWS[1], hub)
         demo.attendant = Pusher(demo)
@@ -101,7 +101,7 @@ def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(cap
     for law, simulated, _ in at_rest:
         assert law > 10.0
         assert simulated == pytest.approx(law, rel=0.05)
-    if "With this many latches" not in text:
+    if "With this many latches" not in text and "deadlines were missed in a row" not in caplog.text:
         assert any(real == pytest.approx(law, rel=0.05) for law, _, real in at_rest)
     rms, most = numbers(text, "reset; the next circle is tracked to")
     assert 0.0 < rms < most < 50.0
