@@ -33,7 +33,7 @@ IMPORTS = {
     "its plant": "import pydrake.multibody.plant",
     "the scenario": "import vtbdrake_diagrams.manipulator.scenario",
 }
-"""What a process imports before it builds the DPS, each beside all before it."""
+"""The imports of a process before it builds the DPS, each beside all before it."""
 
 
 def dps_alone_start(repeats: int = 3) -> list[Benchmark]:

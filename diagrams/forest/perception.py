@@ -109,7 +109,7 @@ class LandmarkSensor:
 
     def times(self, inputs: Mapping[str, Any]) -> list[float]:
         """Return the times of its samples in s, among the inputs of a `Localizer`."""
-        return [float(inputs[f"{name}_time"][0]) for name in self.signals]
+        return [float(np.ravel(inputs[f"{name}_time"])[0]) for name in self.signals]
 
     def view(self, inputs: Mapping[str, Any], history: Array) -> SensorView:
         """Return what it detects, from the inputs of a `Localizer`.

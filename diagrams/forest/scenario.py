@@ -392,12 +392,12 @@ class ForestScenario(CarrierScenario):
 
     @property
     def has_scanner(self) -> bool:
-        """Whether the unit has the scanner."""
+        """Return whether the unit has the scanner."""
         return self.perception != "stereo"
 
     @property
     def has_stereo(self) -> bool:
-        """Whether the unit has the pair of cameras."""
+        """Return whether the unit has the pair of cameras."""
         return self.perception != "scanner"
 
     def check_perception(self) -> None:

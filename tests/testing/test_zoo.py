@@ -61,7 +61,7 @@ MESSAGES = {
     "check_fork_is_the_future": "simulated from a copy at 0.15 s",
     "check_snapshot_resumes": "simulated from a snapshot at 0.15 s",
     "check_dropped_testbed_is_freed": "1 DiscreteTimeIntegrator",
-    "check_runs_keep_no_memory": "objects of Python behind: something outside of the Context keeps them",
+    "check_runs_keep_no_memory": "objects of Python behind",
     "check_sim_and_real_alike": "position measures [0.03984], but [0.0398] arrives",
     "check_dps_cannot_tell_the_switch": "[0.1] instead of [0.2]",
     "check_dps_alone_commands_the_same": "[0.8] instead of [0.801]",
@@ -112,6 +112,10 @@ def test_bad_diagram_fails_its_check_alone(name):
     errors = {check.__name__: subject.outcome(check) for check in checks}
     failures = {check: str(error) for check, error in errors.items() if isinstance(error, CheckFailedError)}
     assert failures.keys() == {name} and MESSAGES[name] in failures[name], failures
+    if name == "check_runs_keep_no_memory":
+        # One of 30; other objects of the process may be freed meanwhile.
+        counted = re.search(r"leaves (\d+) objects", failures[name])
+        assert counted is not None and 29 <= int(counted[1]) <= 30, failures
     for check, error in errors.items():
         if isinstance(error, CheckSkippedError) and check not in NOT_CONCERNED and name not in EVERYTHING_NEEDS:
             assert name in str(error), (check, error)

@@ -35,7 +35,6 @@ from threadpoolctl import threadpool_limits
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
-from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit, Views
 from vtbdrake.testbed import VirtualTestbed
@@ -239,12 +238,14 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         x, y, _, roll, pitch, yaw = pose(context)
         # By then the sample has arrived, and its time lies within the history.
         simulator.AdvanceTo(due + 2.0 * PERIOD)
-        taken, past = sensors[shown[0]].time(context), history(context)
+        past, samples = history(context), [(sensors[k].sensor, sensors[k](context)) for k in shown]
+        sensor, inputs = samples[0]
+        taken = sensor.times(inputs)[-1]
         reckoned_pose = carrier_pose_at(past, taken)
         X_OH = np.array([reckoned_pose.x, reckoned_pose.y, reckoned_pose.heading])
         tilt = np.array([reckoned_pose.roll - roll, reckoned_pose.pitch - pitch])
         rows.append((taken, np.array([x, y, yaw]), X_OH, tilt))
-        views.append([sensors[which].view(context, past) for which in shown])
+        views.append([sensor.view(inputs, past) for sensor, inputs in samples])
         if len(rows) > 1:
             travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
     times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
@@ -270,15 +271,8 @@ class _SensorReader:
         times = {f"{name}_time": testbed.reader(f"{arrival}.time") for name, arrival in arrivals.items()}
         return cls(sensor, samples | times)
 
-    def time(self, context: Context) -> float:
-        return float(self.inputs[f"{self.sensor.signals[-1]}_time"](context))
-
-    def view(self, context: Context, history: Array) -> SensorView:
-        inputs = {
-            name: np.atleast_1d(read(context)) if "_time" in name else read(context)
-            for name, read in self.inputs.items()
-        }
-        return self.sensor.view(inputs, history)
+    def __call__(self, context: Context) -> dict[str, Any]:
+        return {name: read(context) for name, read in self.inputs.items()}
 
 
 def _due(periods: Sequence[float]) -> Iterator[tuple[float, list[int]]]:

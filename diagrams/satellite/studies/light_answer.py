@@ -30,9 +30,9 @@ off, since that comes on top."""
 TELLING = 0.5
 """The least difference of mean times that means anything, in s: the cost has a period of 0.2 s."""
 FASTER = "faster than"
-"""How the choice compares with today's constants if the interval of its gain is above 0, and reaches `TELLING`."""
+"""The comparison of the choice with today's constants if the interval of its gain is above 0, and reaches `TELLING`."""
 AS_FAST = "as fast as"
-"""How it compares if that interval is within `TELLING` about 0: then the parameters do not matter."""
+"""The comparison if the interval of the gain is within `TELLING` about 0: then the parameters do not matter."""
 TELLING_ERROR = 1e-3
 """The least difference of errors that means anything, in m: today's constants are about as far off."""
 CONFIDENCE = 0.9

@@ -27,7 +27,7 @@ from vtbdrake_diagrams.satellite.studies.light_cases import (
 )
 
 FINALISTS = 2
-"""How many candidates of the screening race with today's constants."""
+"""The number of candidates of the screening that race with today's constants."""
 RACE_BUDGET = 3 * len(RACED_ON)
 """The number of captures that the race may take, the screening's included."""
 

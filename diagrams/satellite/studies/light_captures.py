@@ -135,7 +135,7 @@ def _mark(condition: Mapping[str, Any]) -> tuple[Any, ...]:
 
 @dataclass
 class Results:
-    """What is kept in `RESULTS`.
+    """The captures that are kept in `RESULTS`.
 
     Attributes:
         candidates: The number of candidates of the screening.

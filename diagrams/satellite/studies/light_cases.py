@@ -28,7 +28,7 @@ from vtbdrake_diagrams.satellite.studies.grips import (
 from vtbdrake_diagrams.satellite.supervisor import Mode
 
 HORIZON = 36.0
-"""How long a capture may take, in s: twice as long as with today's constants and the sun beside."""
+"""The longest time of a capture in s: twice as long as with today's constants and the sun beside."""
 UNFINISHED = 61.0
 """The cost of a capture that neither holds the bar nor was aborted by `HORIZON`, in s; a rollout ends when its cost is
 below."""

@@ -104,10 +104,20 @@ def test_simulated_drive_stays_in_the_stand() -> None:
     assert np.diff(drive.times) == pytest.approx(0.2)
 
 
+BOTH = ForestScenario(seed=1, perception="both", length=60.0, width=60.0, start=12.0)
+
+
 @pytest.mark.slow
-def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
-    scenario = ForestScenario(seed=5, density=500.0, undergrowth=0.0)
+@pytest.mark.parametrize(
+    ("scenario", "kinds"),
+    [
+        (ForestScenario(seed=5, density=500.0, undergrowth=0.0), [[True]] * 6),
+        (BOTH, [[True], [True], [False], [True], [True], [True, False]]),
+    ],
+)
+def test_recorded_drive_gives_what_the_dps_itself_finds(scenario: ForestScenario, kinds: list[list[bool]]) -> None:
     drive = recorded_drive(scenario, length=1.5)
+    assert [[view.is_scan for view in views] for views in drive.landmarks][:6] == kinds
     found = localize(drive, scenario.unit(scenario.global_map()))
     testbed = scenario.build()
     simulator = testbed.simulator()
@@ -119,6 +129,8 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     # The result of the last scan is shown some periods later, and before the result of the next.
     simulator.AdvanceTo(drive.times[-1] + scenario.localizer_latency + 0.08)
     pose = testbed.read(context, "dps.env.localizer.pose")
+    assert testbed.read(context, "dps.env.localizer.status") == TRACKING
+    assert testbed.read(context, "dps.env.localizer.time") == pytest.approx(drive.times[-1])
     assert found.is_localized[-1] and drive.travelled[-1] == pytest.approx(1.5, abs=0.3)
     np.testing.assert_allclose(pose, found.poses[-1], atol=1e-9)
     np.testing.assert_allclose(pose, drive.truth[-1], atol=0.2)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
-from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive
 from vtbdrake_diagrams.forest.studies.fusion import (
     CONDITIONS,
     MAP_NAMES,
@@ -151,22 +150,3 @@ def test_unit_has_a_message_for_each_sensor() -> None:
     assert periods["SCAN"] == pytest.approx(0.2) and periods["IMAGES"] == pytest.approx(0.5)
     dps = DpsAlone(SCENARIO)
     assert {"left_image", "right_image", "scan"} <= {signal.name for signal in dps.interface.sense}
-
-
-@pytest.mark.slow
-def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
-    drive = recorded_drive(SCENARIO, length=1.5)
-    kinds = [[each.is_scan for each in views] for views in drive.landmarks]
-    assert kinds[:6] == [[True], [True], [False], [True], [True], [True, False]]
-    found = localize(drive, SCENARIO.unit(SCENARIO.global_map()))
-    testbed = SCENARIO.build()
-    simulator = testbed.simulator()
-    context = simulator.get_mutable_context()
-    testbed.write(context, {"sim.act.driver.speed": 0.0})
-    simulator.AdvanceTo(STANDING + 0.2)
-    testbed.write(context, {"sim.act.driver.speed": SCENARIO.speed})
-    simulator.AdvanceTo(drive.times[-1] + SCENARIO.localizer_latency + 0.08)
-    assert testbed.read(context, "dps.env.localizer.status") == TRACKING
-    assert testbed.read(context, "dps.env.localizer.time") == pytest.approx(drive.times[-1])
-    np.testing.assert_allclose(testbed.read(context, "dps.env.localizer.pose"), found.poses[-1], atol=1e-9)
-    np.testing.assert_allclose(found.poses[-1], drive.truth[-1], atol=0.2)
