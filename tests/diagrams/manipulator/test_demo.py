@@ -67,7 +67,7 @@ class Pusher(Attendant):
 
 
 @pytest.mark.slow
-def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(capsys, caplog):
+def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(capsys):
     with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
         demo = Demo(LAWS[1], hub)
         demo.attendant = Pusher(demo)
@@ -79,9 +79,8 @@ def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(cap
         r"shadow +real sensors feed the DPS, which commands the simulated arm: \[",
         r"sent to the machine so far: 0 commands",
         r"real +the DPS alone commanded the machine \(perturbed by up to 5%\), \d+ cycles",
+        # On a busy computer another fault may have come before the provoked one: that a sensor is stale.
         r"latches of the guards, each reset as soon as possible: \d+; the first because",
-        # On a busy computer the machine may have fallen behind before it stood still.
-        r"(sensor signal \w+ is stale: [\d.]+ ms old, 10 allowed|the messages of \w+ come about every [\d.]+ ms)",
         r"tracking error of the tip",
         r"force on the wall \(N\) +law and wall +sim +machine",
         r"cycles of 1000 us, \d+ deadlines missed",
@@ -95,13 +94,13 @@ def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(cap
         r"reset; the next circle is tracked to",
     ]
     assert re.search(".*".join(stages), text, re.DOTALL), text
-    # What follows the fault is as it was, at rest in the press: at one of two instants, as samples that come late on a
-    # a busy computer latch again, and the arm then moves; with too many of them the demo itself disowns its figures.
-    at_rest = [numbers(text, instant) for instant in ("1.5 s", "2.0 s")]
-    for law, simulated, _ in at_rest:
+    # What follows the provoked fault is as it was, at rest in the press. Where the computer was too busy and the guards
+    # latched for that, too, the reference has followed the arm elsewhere: its force then says nothing.
+    undisturbed = "each reset as soon as possible: 1; the first because\n        sensor signal" in text
+    for instant in ("1.5 s", "2.0 s"):
+        law, simulated, real = numbers(text, instant)
         assert law > 10.0
         assert simulated == pytest.approx(law, rel=0.05)
-    if "With this many latches" not in text and "deadlines were missed in a row" not in caplog.text:
-        assert any(real == pytest.approx(law, rel=0.05) for law, _, real in at_rest)
+        assert real == pytest.approx(law, rel=0.05) or not undisturbed
     rms, most = numbers(text, "reset; the next circle is tracked to")
     assert 0.0 < rms < most < 50.0
