@@ -221,7 +221,14 @@ def _same(a: tuple[Any, ...] | None, b: tuple[Any, ...] | None) -> bool:
 def _equal(x: Any, y: Any) -> bool:
     if isinstance(x, str) or isinstance(y, str):
         return bool(x == y)
-    return np.array_equal(x, y, equal_nan=np.asarray(x).dtype.kind in "fc")
+    # As a rule arrays are equal, and their bytes are compared in a tenth of the time.
+    return _same_bytes(x, y) or np.array_equal(x, y, equal_nan=np.asarray(x).dtype.kind in "fc")
+
+
+def _same_bytes(x: Any, y: Any) -> bool:
+    if not (isinstance(x, np.ndarray) and isinstance(y, np.ndarray)) or x.dtype.hasobject:
+        return False
+    return x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
 
 
 def python_attributes(testbed: VirtualTestbed) -> dict[str, Any]:

@@ -58,6 +58,7 @@ class _Point:
 
     def __init__(self, system: System, context: Context, groups: Any) -> None:
         self.system = system
+        self._alone = system.CreateDefaultContext()
         ports = [system.get_input_port(index) for index in range(system.num_input_ports())]
         ports = [port for port in ports if port.HasValue(context)]
         vectors = [port for port in ports if port.get_data_type() == PortDataType.kVectorValued]
@@ -82,9 +83,16 @@ class _Point:
             k -= size
         raise IndexError(k)
 
-    def results(self, system: Any, x: Any, constant: Any) -> Iterator[tuple[str, Any]]:
-        """Yield what ``system``, of the scalar type of ``x``, computes; ``constant`` makes its type of numbers."""
-        context = system.CreateDefaultContext()
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Return the results of the system at x, in one array."""
+        results = self.results(self.system, self._alone, x, np.asarray)
+        return np.concatenate([np.zeros(0), *(values for _, values in results)])
+
+    def results(self, system: Any, context: Any, x: Any, constant: Any) -> Iterator[tuple[str, Any]]:
+        """Yield what ``system``, of the scalar type of ``x``, computes in a context of its own.
+
+        ``constant`` makes its type of numbers.
+        """
         start = 0
         for index, value in self.inputs.items():
             system.get_input_port(index).FixValue(context, x[start : start + value.size])
@@ -113,8 +121,12 @@ def _compare(path: str, point: _Point, converted: Any) -> None:
     if not count:
         return
     seeded = InitializeAutoDiff(point.x).ravel()
-    exact = list(point.results(converted, seeded, lambda v: InitializeAutoDiff(v, np.zeros((v.size, count))).ravel()))
-    expected = np.stack([_slopes(point, k) for k in range(count)], axis=1)
+    context = converted.CreateDefaultContext()
+    exact = list(
+        point.results(converted, context, seeded, lambda v: InitializeAutoDiff(v, np.zeros((v.size, count))).ravel())
+    )
+    here = point.values(point.x)
+    expected = np.stack([_slopes(point, here, k) for k in range(count)], axis=1)
     row = 0
     for name, values in exact:
         gradient = ExtractGradient(values.reshape(-1, 1))
@@ -131,17 +143,13 @@ def _compare(path: str, point: _Point, converted: Any) -> None:
             )
 
 
-def _slopes(point: _Point, k: int) -> np.ndarray:
-    """Return the derivatives of all results by entry k of x; NaN at a kink or a jump."""
-    here, slopes = _values(point, point.x), []
+def _slopes(point: _Point, here: np.ndarray, k: int) -> np.ndarray:
+    """Return the derivatives of all results, which are ``here`` at x, by entry k of x; NaN at a kink or a jump."""
+    slopes = []
     for size in _STEPS:
         for sign in (1.0, -1.0):
             step = np.zeros(point.x.size)
             step[k] = sign * size * max(1.0, abs(point.x[k]))
-            slopes.append((_values(point, point.x + step) - here) / step[k])
+            slopes.append((point.values(point.x + step) - here) / step[k])
     mean = np.mean(slopes[:2], axis=0)
     return np.where(np.isclose(slopes, mean, rtol=1e-3, atol=_TOLERANCE).all(axis=0), mean, np.nan)
-
-
-def _values(point: _Point, x: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.zeros(0), *(values for _, values in point.results(point.system, x, np.asarray))])

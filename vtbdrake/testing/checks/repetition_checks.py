@@ -37,6 +37,7 @@ from vtbdrake.testing.subject import CheckFailedError, Subject
 __tracebackhide__ = True
 
 _NOISE = 3  # objects that Python itself may make meanwhile
+_SAMPLES = 200  # of a simulation in which objects are counted, at most
 
 
 def check_simulates(subject: Subject) -> None:
@@ -176,7 +177,13 @@ def check_dropped_testbed_is_freed(subject: Subject) -> None:
     context = subject.started(testbed)
     testbed.simulator(context).AdvanceTo(min(subject.period, float(subject.instants[-1])))
     del testbed, context
-    alive = {number: system for number, system in _systems().items() if number not in before}
+    alive: dict[int, System] = {}
+    for _ in range(3):  # What a system of the Diagram owns is freed after it.
+        alive.clear()
+        gc.collect()
+        alive.update((number, system) for number, system in _systems().items() if number not in before)
+        if not alive:
+            break
     if alive:
         counts = Counter(map(class_name, alive.values()))
         names = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
@@ -197,7 +204,7 @@ def check_runs_keep_no_memory(subject: Subject) -> None:
     A study simulates a hundred thousand times. What grows is a list or a dictionary outside of the Context: a log, a
     cache without a limit.
     """
-    runner, count = subject.runner(1), len(subject.reference)
+    runner, count = subject.runner(1), min(len(subject.reference), _SAMPLES)
     subject.presuppose_simulation()
     counts = []
     for _ in range(4):
@@ -277,7 +284,5 @@ def _values_held(function: FunctionType) -> Iterator[object]:
 
 
 def _systems() -> dict[int, System]:
-    """Return all systems that Python knows and that are alive, by identity."""
-    for _ in range(3):  # What a system of the Diagram owns is freed after it.
-        gc.collect()
+    """Return all systems that Python knows, by identity: those that are alive, and those not collected yet."""
     return {id(thing): thing for thing in gc.get_objects() if isinstance(thing, System)}
