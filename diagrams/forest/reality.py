@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squa
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotation
-from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
-from vtbdrake_diagrams.forest.studies.clouds import PARTIAL, Cloud, Scanner, rings, virtual_scan
+from vtbdrake.components.localization.trunks import detect_trunks
+from vtbdrake_diagrams.forest.studies.clouds import PARTIAL, STEM, Cloud, Scanner, rings, virtual_scan
 from vtbdrake_diagrams.forest.studies.recordings import read_r, rioja, stems
 
 # The displacement of neighbouring plots of La Rioja in their common frame: each plot's shift is a multiple of both.
@@ -38,19 +39,21 @@ CLOUDS = {"pine plantation": "treels/pine_plot.laz", "ponderosa, TLS": "spanner/
 """Clouds with the range noise of a terrestrial scanner."""
 MOBILE = {"ponderosa, mobile": "spanner/MLS_Clip.laz"}
 """Clouds that were scanned while walking, whose points scatter more."""
-# Range noise of `CLOUDS`, in m.
-_NOISE = 0.02
-# Range noise of `MOBILE`, in m.
-_MOBILE_NOISE = 0.03
+NOISE = 0.02
+"""Range noise of `CLOUDS`, in m."""
+MOBILE_NOISE = 0.03
+"""Range noise of `MOBILE`, in m."""
+FROM_THE_AIR = {"ponderosa, from the air": ("spanner/UAS_Clip.laz", "ponderosa, mobile", (0.6, -0.01, 0.0))}
+"""Clouds that had no part in the detector, the clouds of the same place whose rings are their reference, and by what in
+m these are displaced, so that the rings of both coincide."""
 ALONE = {"one pine": "treels/pine.laz"}
 """Clouds of single trees, which had no part in the choice of the detector's constants."""
 SCANNER = Scanner(rows=32, columns=1800, elevation=np.radians(40.0))
-_EYE = 2.0
+EYE = 2.0
+"""Height of the scanner over the ground, in m."""
 _BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
 # A detection within this distance of a stem is right, in m.
 _RIGHT = 0.25
-# A detection within this distance of any ring belongs to a stem, in m.
-_STEM = 0.6
 # The `outline` (m) with which the detector runs a second time: covariances are linear in its square.
 _OUTLINE = 0.05
 # 95 % of the squared errors of positions lie below.
@@ -160,14 +163,16 @@ def disagreement(first: Fix, second: Fix) -> tuple[float, float]:
 class Detection:
     """The detector in one virtual scan, against the rings of the cloud.
 
+    What is counted, all but the last five, is beyond the border of the half that the detector's weights are fitted to.
+
     Attributes:
         distances: Distances of the stems that the scan shows, (k,) in m.
         right: Which of them are detected, (k,).
-        errors: Position error and error of the diameter of the detections that are right, (m, 2) in m.
+        errors: Position error and error of the diameter of the detections that are right, (l, 2) in m.
         beside: Distances of detections of a stem that are off by more than `_RIGHT`.
         false: Distances of detections where the cloud shows no stem, not even one seen from one side.
-        stems: Which stems these are of, (m,).
-        matched: Which of the trunks these are, (m,).
+        stems: Which stems are detected, (m,).
+        matched: Which of the trunks these detections are, (m,).
         trunks: The detections, in the frame of the cloud turned by nothing, around the scanner.
         outlined: The same with covariances for an outline of `_OUTLINE`.
         eye: The position of the scanner, (3,).
@@ -195,6 +200,11 @@ def grid(cloud: Cloud, step: float) -> Iterator[Array]:
                 yield np.array([x, y])
 
 
+def grid_step(cloud: Cloud) -> float:
+    """Return the step of the `grid` of scanners in a cloud, in m."""
+    return 2.0 if np.ptp(cloud.points[:, 0]) < 15.0 else 4.0
+
+
 def around(stem: Array) -> Iterator[Array]:
     """Yield places (2,) around a stem: twelve of them in each bin of distances."""
     for low, high in pairwise(_BINS):
@@ -203,28 +213,25 @@ def around(stem: Array) -> Iterator[Array]:
 
 
 def detections(
-    cloud: Cloud, full: Array, partial: Array, *, noise: float, places: Iterable[Array]
+    cloud: Cloud, full: Array, partial: Array, *, noise: float, places: Iterable[Array], border: float = -inf
 ) -> Iterator[Detection]:
-    """Yield the detector's results for scanners at these places (2,)."""
-    detector = TrunkDetectorConfig(
-        azimuth_step=2.0 * np.pi / SCANNER.columns,
-        elevation_step=SCANNER.elevation / SCANNER.rows,
-        range_noise=noise,
-    )
+    """Yield the detector's results for scanners at these places (2,), counted at x > ``border``."""
+    detector = SCANNER.detector(noise)
     for place in places:
-        eye = np.array([*place, cloud.ground(place) + _EYE])
+        eye = np.array([*place, cloud.ground(place) + EYE])
         points = virtual_scan(cloud, eye, SCANNER)
         trunks, outlined = (
-            detect_trunks(points - eye + [0.0, 0.0, _EYE], each, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
+            detect_trunks(points - eye + [0.0, 0.0, EYE], each, p_HoLo_H=np.array([0.0, 0.0, EYE]))
             for each in (detector, replace(detector, outline=_OUTLINE))
         )
-        yield _judged(points, eye, trunks, outlined, full, partial)
+        yield _judged(points, eye, trunks, outlined, full, partial, border)
 
 
 def _judged(
-    points: Array, eye: Array, trunks: Landmarks, outlined: Landmarks, full: Array, partial: Array
+    points: Array, eye: Array, trunks: Landmarks, outlined: Landmarks, full: Array, partial: Array, border: float
 ) -> Detection:
-    shown = np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
+    beyond = full[:, 0] > border
+    shown = beyond & np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
     places = trunks.positions + eye[:2]
     apart = np.linalg.norm(full[:, None, :2] - places[None], axis=2)
     stem, detection = one_to_one(1.0 - apart)
@@ -232,7 +239,7 @@ def _judged(
     stem, detection = stem[near], detection[near]
     right = np.zeros(len(full), dtype=bool)
     right[stem] = True
-    rest = np.setdiff1d(np.arange(len(places)), detection)
+    rest = np.setdiff1d(np.flatnonzero(places[:, 0] > border), detection)
     nearest = cKDTree(np.vstack([full, partial])[:, :2]).query(places[rest])[0] if len(rest) else np.zeros(0)
     away = np.linalg.norm(places[rest] - eye[:2], axis=1)
     errors = np.column_stack([apart[stem, detection], trunks.diameters[detection] - full[stem, 2]])
@@ -240,9 +247,9 @@ def _judged(
     return Detection(
         distances=distances[shown],
         right=right[shown],
-        errors=errors,
-        beside=away[nearest < _STEM],
-        false=away[nearest >= _STEM],
+        errors=errors[beyond[stem]],
+        beside=away[nearest < STEM],
+        false=away[nearest >= STEM],
         stems=stem,
         matched=detection,
         trunks=trunks,
@@ -256,7 +263,7 @@ def _is_shown(points: Array, eye: Array, stem: Array) -> bool:
     arm = stem[:2] - eye[:2]
     forward = arm / np.linalg.norm(arm)
     delta, radius = points[:, :2] - stem[:2], 0.5 * stem[2]
-    heights = points[:, 2] - eye[2] + _EYE
+    heights = points[:, 2] - eye[2] + EYE
     on = (np.abs(np.linalg.norm(delta, axis=1) - radius) < 0.06) & (heights > 0.4) & (heights < 3.2)
     on &= delta @ forward < 0.6 * radius
     across = delta[on] @ np.array([-forward[1], forward[0]]) / radius
@@ -381,22 +388,59 @@ OUTLINE_HEADER = (
 CHAIN_HEADER = ("cloud", "stems on the map", "trunks in a scan", "sure", "wrong", "error, m")
 
 
-def cloud_results(folder: Path) -> Iterator[tuple[str, Array, list[Detection]]]:
-    """Yield the name, the stems and the results of each cloud."""
-    for clouds, noise in ((CLOUDS, _NOISE), (MOBILE, _MOBILE_NOISE)):
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A cloud of a plot of forest.
+
+    Attributes:
+        name: The name of the cloud.
+        cloud: The cloud.
+        full: The stems whose full rings are seen, (k, 3), see `rings`.
+        partial: The stems whose rings are seen from one side at least, (l, 3).
+        noise: The range noise in m.
+        is_fitted: Whether the detector's weights are fitted to the half at x below `border`.
+    """
+
+    name: str
+    cloud: Cloud
+    full: Array
+    partial: Array
+    noise: float
+    is_fitted: bool = True
+
+    @property
+    def border(self) -> float:
+        """The x beyond which the plot judges the detector."""
+        return float(np.median(self.full[:, 0]))
+
+
+def plots(folder: Path) -> Iterator[Plot]:
+    """Yield the clouds of plots of forest."""
+    by_name: dict[str, Plot] = {}
+    for clouds, noise in ((CLOUDS, NOISE), (MOBILE, MOBILE_NOISE)):
         for name, path in clouds.items():
             cloud = Cloud.read(folder / path)
-            full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
-            step = 2.0 if np.ptp(cloud.points[:, 0]) < 15.0 else 4.0
-            yield name, full, list(detections(cloud, full, partial, noise=noise, places=grid(cloud, step)))
+            by_name[name] = Plot(name, cloud, rings(cloud), rings(cloud, arc=PARTIAL, fewest=8), noise)
+    yield from by_name.values()
+    for name, (path, reference, shift) in FROM_THE_AIR.items():
+        full, partial = (stems + np.array(shift) for stems in (by_name[reference].full, by_name[reference].partial))
+        yield Plot(name, Cloud.read(folder / path), full, partial, MOBILE_NOISE, is_fitted=False)
 
 
-def alone_results(folder: Path) -> Iterator[tuple[str, list[Detection]]]:
-    """Yield the name and the results of each cloud of a single tree."""
+def cloud_results(folder: Path) -> Iterator[tuple[str, Array, list[Detection]]]:
+    """Yield the name, the stems and the results of each plot."""
+    for plot in plots(folder):
+        places = grid(plot.cloud, grid_step(plot.cloud))
+        results = detections(plot.cloud, plot.full, plot.partial, noise=plot.noise, places=places, border=plot.border)
+        yield plot.name, plot.full, list(results)
+
+
+def alone_results(folder: Path) -> Iterator[tuple[str, Array, list[Detection]]]:
+    """Yield the name, the stem and the results of each cloud of a single tree."""
     for name, path in ALONE.items():
         cloud = Cloud.read(folder / path)
         full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
-        yield name, list(detections(cloud, full, partial, noise=_NOISE, places=around(full[0])))
+        yield name, full, list(detections(cloud, full, partial, noise=NOISE, places=around(full[0])))
 
 
 @click.command()
@@ -406,7 +450,7 @@ def main(folder: Path) -> None:
     print(table(FIELD_HEADER, list(field_rows(folder))), "\n")
     results = list(cloud_results(folder))
     alone = list(alone_results(folder))
-    print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, *_, scans in [*results, *alone]]), "\n")
+    print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, _, scans in [*results, *alone]]), "\n")
     rows = [row for name, full, scans in results for row in outline_rows(name, full, scans)]
     print(table(OUTLINE_HEADER, rows), "\n")
     print(table(CHAIN_HEADER, [chain_row(name, full, scans) for name, full, scans in results]))

@@ -58,7 +58,7 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "typical_diameter": "(0, inf)",
             "diameter_spread": "(0, inf)",
             "lean": "(0, 0.5)",
-            "largest_misfit": "(0, inf]",
+            "least_probability": "[0, 1]",
             "position_floor": "[0, inf)",
             "diameter_floor": "[0, inf)",
         },

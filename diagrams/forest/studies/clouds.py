@@ -18,6 +18,7 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from vtbdrake.common.arrays import Array
+from vtbdrake.components.localization.trunks import TrunkDetectorConfig
 
 # Edge length of the cells whose lowest points are the ground, in m.
 _CELL = 1.0
@@ -54,6 +55,8 @@ FULL = 0.6
 """The share of a circle on which a full ring has points."""
 PARTIAL = 0.35
 """The share of a circle on which a ring has points that was seen from one side."""
+STEM = 0.6
+"""A detection within this distance of any ring, in m, belongs to a stem."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +117,12 @@ class Scanner:
     elevation: float = np.pi / 6.0
     reach: float = 25.0
 
+    def detector(self, noise: float) -> TrunkDetectorConfig:
+        """Return the settings of the detector of trunks for this scanner with a range noise in m."""
+        return TrunkDetectorConfig(
+            azimuth_step=2.0 * np.pi / self.columns, elevation_step=self.elevation / self.rows, range_noise=noise
+        )
+
 
 def virtual_scan(cloud: Cloud, eye: Array, scanner: Scanner) -> Array:
     """Return the points of a cloud that a scanner at ``eye`` (3,) sees, (n, 3): the nearest one of each ray.
@@ -170,6 +179,11 @@ def rings(cloud: Cloud, *, arc: float = FULL, fewest: int = 15, seed: int = 0) -
         line = np.linalg.lstsq(A, circles[near, :3], rcond=None)[0]
         stems.append(line[0] * [1.0, 1.0, 2.0])
     return np.array(stems).reshape(-1, 3)
+
+
+def border_of(stems: Array) -> float:
+    """Return the x that halves the stems of a cloud (k, 3): the detector's weights are fitted to those below it."""
+    return float(np.median(stems[:, 0]))
 
 
 def _rings_of_slice(cloud: Cloud, height: float, arc: float, fewest: int, rng: np.random.Generator) -> Array:

@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,20 @@ def test_parts_are_joined_and_selected():
     assert len(Landmarks.joined([])) == 0
 
 
+def test_probabilities_are_1_unless_they_are_given_and_stay_with_their_landmarks():
+    landmarks = some()
+    np.testing.assert_array_equal(landmarks.probabilities, np.ones(len(landmarks)))
+    unsure = replace(landmarks, probabilities=np.linspace(0.1, 0.9, len(landmarks)))
+    moved = unsure.seen_from([1.0, -2.0, 0.3]).widened(0.1)
+    np.testing.assert_array_equal(moved.probabilities, unsure.probabilities)
+    np.testing.assert_array_equal(unsure.select([1]).probabilities, unsure.probabilities[1:2])
+    both = Landmarks.joined([unsure, landmarks])
+    np.testing.assert_array_equal(both.probabilities, [*unsure.probabilities, *np.ones(len(landmarks))])
+    for bad in (-0.1, 1.5):
+        with pytest.raises(ValueError, match="probabilities of landmarks are from 0 to 1"):
+            replace(landmarks, probabilities=np.full(len(landmarks), bad))
+
+
 def test_landmarks_are_values_with_a_codec():
     landmarks = some()
     assert copy.deepcopy(landmarks) is landmarks
@@ -67,7 +82,7 @@ def test_landmarks_are_values_with_a_codec():
         landmarks.positions[0] = 1.0
     codec = codec_of(Landmarks.empty(), varying=True)
     again = codec.decode(codec.encode(landmarks))
-    for name in ("positions", "covariances", "diameters", "diameter_deviations"):
+    for name in ("positions", "covariances", "diameters", "diameter_deviations", "probabilities"):
         np.testing.assert_array_equal(getattr(again, name), getattr(landmarks, name))
 
 

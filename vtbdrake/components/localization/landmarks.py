@@ -9,7 +9,7 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.common.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable, set_read_only
 from vtbdrake.components.localization.planar import rotation, transform
 from vtbdrake.components.world_model import WorldModel
 
@@ -29,21 +29,25 @@ class Landmarks:
         covariances: Covariances of the positions in m^2, shape (n, 2, 2).
         diameters: Diameters in m, shape (n,).
         diameter_deviations: Standard deviations of the diameters in m, shape (n,); infinite for unknown diameters.
+        probabilities: The probability of each to be what it was taken for, such as a trunk, shape (n,); by default 1.
 
     Raises:
-        ValueError: The shapes do not agree, a position, covariance or diameter is not finite, or a deviation or a
-            variance is negative.
+        ValueError: The shapes do not agree, a position, covariance or diameter is not finite, a deviation or a
+            variance is negative, or a probability is not from 0 to 1.
     """
 
     positions: Array
     covariances: Array
     diameters: Array
     diameter_deviations: Array
+    probabilities: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         n = len(self.positions)
-        shapes = {"positions": (n, 2), "covariances": (n, 2, 2), "diameters": (n,), "diameter_deviations": (n,)}
-        for name, shape in shapes.items():
+        if getattr(self, "probabilities", None) is None:
+            set_read_only(self, probabilities=np.ones(n))
+        shapes = {"positions": (n, 2), "covariances": (n, 2, 2)}
+        for name, shape in {field.name: shapes.get(field.name, (n,)) for field in fields(self)}.items():
             array = getattr(self, name)
             if array.shape != shape:
                 raise ValueError(f"{name} of {n} landmarks have the shape {shape}, not {array.shape}")
@@ -52,6 +56,8 @@ class Landmarks:
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)
         if (self.diameter_deviations < 0.0).any() or (variances < 0.0).any():
             raise ValueError("standard deviations and variances of landmarks are at least 0")
+        if not ((self.probabilities >= 0.0) & (self.probabilities <= 1.0)).all():
+            raise ValueError(f"probabilities of landmarks are from 0 to 1, not {self.probabilities.tolist()}")
 
     @classmethod
     def empty(cls) -> Landmarks:
@@ -85,6 +91,7 @@ class Landmarks:
             R_AB @ self.covariances @ R_AB.T,
             self.diameters,
             self.diameter_deviations,
+            self.probabilities,
         )
 
 

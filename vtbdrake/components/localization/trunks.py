@@ -1,9 +1,10 @@
 """Trunks of trees from the points of one scan: the positions of their axes, and their diameters.
 
-A trunk is an object that returns most of the rows of rays that pass its place within a slice of heights over the
-ground, is as wide as a trunk, opaque, and has a surface as smooth as a cylinder's. It is fitted as a leaning
-cylinder: horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0)
-with z0 at breast height.
+A candidate is an object that returns most of the rows of rays that pass its place within a slice of heights over the
+ground, and is as wide as a trunk. Its probability to be one follows from several measures: whether it is opaque, as
+smooth and round as a cylinder, and apart from others (`trunk_evidence`). It is fitted as a leaning cylinder: horizontal
+sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0) with z0 at breast
+height.
 
 Errors are errors of the ranges along the rays. A ray at the azimuth a, with the horizontal unit vectors e along it and
 n to the left of it, meets a circle with the centre c at the horizontal distance
@@ -21,6 +22,7 @@ over the heights measures it. Covariances come from the weighted least squares, 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import inf, pi
 
@@ -32,6 +34,7 @@ from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations, wrap
 from vtbdrake.components.localization.scan_scene import Cells, Clusters, ScanDetectorConfig, ScanPoints
+from vtbdrake.components.localization.trunk_evidence import TrunkEvidence
 
 # The number of layers of the slice, one bit each.
 _LAYERS = 8
@@ -50,12 +53,20 @@ _PERSISTENCE = (0.35, 0.65)
 _FACE = 0.15
 # Least width of a column, in m.
 _COLUMN = 0.03
-# A trunk is opaque: of the rays towards it, at least this share ends on it.
+# In a planar scan, at least this share of the rays towards a trunk ends on it.
 _OPAQUE = 0.8
+# In a planar scan, the largest mean square of the weighted errors of the ranges, in units of their variance.
+_LARGEST_MISFIT = 2.0
 # Rays towards a trunk pass its axis within this share of its radius.
 _INNER = 0.85
 # They end on it, behind it, or less than this distance in front of it, in m.
 _SURROUNDINGS = 0.5
+# Beside a trunk, from this share of its radius and a margin in m, clutter is counted,
+_BESIDE = (1.2, 0.02)
+# in strips of this width in m,
+_STRIP = 0.25
+# up to this distance in front of it and behind it, in m.
+_NEAR = 0.3
 # The more the error of an edge exceeds this number of standard deviations, the less it counts: it may be a branch.
 _DOUBT = 4.0
 # A negligible information in 1/m^2, which keeps matrices regular where no point is left.
@@ -96,11 +107,8 @@ class TrunkDetectorConfig(ScanDetectorConfig):
     typical_diameter: float = setting(0.2, "Mean of the prior of the diameters.", unit="m", gt=0.0)
     diameter_spread: float = setting(0.15, "Standard deviation of the prior of the diameters.", unit="m", gt=0.0)
     lean: float = setting(0.03, "Standard deviation of the prior of the lean, per axis.", unit="rad", gt=0.0, lt=0.5)
-    largest_misfit: float = setting(
-        2.0,
-        "The largest mean square of the weighted errors of the ranges, in units of their variance.",
-        gt=0.0,
-        finite=False,
+    least_probability: float = setting(
+        0.5, "The least probability of a detection to be a trunk, see `TrunkEvidence`.", ge=0.0, le=1.0
     )
     position_floor: float = setting(
         0.015,
@@ -126,12 +134,31 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_
         p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
 
     Returns:
-        The trunks in H, each at its reference height, with the covariances of the fit and the floors.
+        The trunks in H, each at its reference height, with the covariances of the fit and the floors, and with the
+        probabilities of `TrunkEvidence`.
 
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    return _trunks(_upright(ScanPoints.of(points_H, p_HoLo_H, detector), detector), detector, p_HoLo_H)
+    return trunk_candidates(points_H, detector, p_HoLo_H=p_HoLo_H)[0]
+
+
+def trunk_candidates(
+    points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_H: ArrayLike
+) -> tuple[Landmarks, TrunkEvidence]:
+    """Find the trunks in the points of a scan, and their evidence.
+
+    Args:
+        points_H: The points in the level frame H of the carrier, as for `detect_trunks`.
+        detector: The settings: with a ``least_probability`` of 0, objects of any probability are trunks.
+        p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
+
+    Returns:
+        The detections of `detect_trunks`, and the measures that their probabilities follow from.
+    """
+    clusters = _upright(ScanPoints.of(points_H, p_HoLo_H, detector), detector)
+    parts = list(_trunks(clusters, detector, p_HoLo_H, _CylinderFits.probable))
+    return Landmarks.joined([part for part, _ in parts]), TrunkEvidence.joined([each for _, each in parts])
 
 
 def detect_planar_trunks(
@@ -144,13 +171,15 @@ def detect_planar_trunks(
 
     Args:
         points_H: The points in the level frame H of the carrier, shape (n, 3) in m, in any order; their z is ignored.
-        detector: The settings; the elevation step, the heights and the share of rows mean nothing here.
+        detector: The settings; the elevation step, the heights, the share of rows and the least probability mean
+            nothing here.
         p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
         field: The directions in H in rad of the last ray to the right and to the left. Objects are left out if these
             may show a part of them only.
 
     Returns:
-        The trunks in H, with the covariances of the fit and the floors. Edges that something nearer hides are not used.
+        The trunks in H, with the covariances of the fit and the floors; their probabilities are not estimated. Edges
+        that something nearer hides are not used.
 
     Raises:
         ValueError: The points have another shape, or are not finite; the field is not from the right to the left.
@@ -166,19 +195,27 @@ def detect_planar_trunks(
         half = 0.5 * (left - right)
         aside = np.abs(wrap(scene.azimuths[clusters.rows] - right - half))
         clusters = clusters.select(clusters.sums((aside > half - 1.5 * detector.azimuth_step).astype(float)) == 0.0)
-    return _trunks(clusters, detector, p_HoLo_H)
+    parts = _trunks(clusters, detector, p_HoLo_H, _CylinderFits.apart)
+    trunks = Landmarks.joined([part for part, _ in parts])
+    return replace(trunks, probabilities=np.ones(len(trunks)))
 
 
-def _trunks(clusters: Clusters, detector: TrunkDetectorConfig, p_HoLo_H: ArrayLike) -> Landmarks:
-    """Return the clusters that are trunks."""
-    trunks = []
+def _trunks(
+    clusters: Clusters,
+    detector: TrunkDetectorConfig,
+    p_HoLo_H: ArrayLike,
+    test: Callable[[_CylinderFits, TrunkEvidence], NDArray[np.bool_]],
+) -> Iterator[tuple[Landmarks, TrunkEvidence]]:
+    """Yield the clusters that are trunks by a test of their fits, and their measures."""
     for persistence in _PERSISTENCE:
         if not len(clusters.rows):
             break
         fit = _CylinderFits(clusters, detector, persistence)
-        trunks.append(fit.trunks(np.asarray(p_HoLo_H)[:2]))
-        clusters = fit.rest
-    return Landmarks.joined(trunks)
+        evidence = fit.evidence()
+        is_trunk = fit.is_possible() & test(fit, evidence)
+        evidence = evidence.select(is_trunk)
+        yield fit.landmarks(np.asarray(p_HoLo_H)[:2], is_trunk, evidence.probabilities()), evidence
+        clusters = clusters.select(~is_trunk)
 
 
 def _upright(scene: ScanPoints, detector: TrunkDetectorConfig) -> Clusters:
@@ -233,35 +270,60 @@ class _CylinderFits:
         self._hidden = clusters.hidden_edges(detector, gap=detector.cell + _GATE * self._variance**0.5)
         self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
         self._columns, self._nearest = self._faces(persistence)
-        self._good = np.zeros(len(clusters.starts), dtype=bool)
-
-    def trunks(self, origin: Array) -> Landmarks:
-        """Return the cylinders that are trunks, if the scanner is at ``origin`` (2,)."""
-        detector, clusters = self._detector, self._clusters
         cylinders, on = self._start()
         for repeated in _ITERATIONS:
             for _ in range(repeated):
                 cylinders = self._improved(cylinders, on)
             on, squares = self._on(cylinders)
-        count = np.maximum(clusters.sums(on.astype(float)), 1.0)
-        misfit = clusters.sums(on * squares) / count
-        diameters, covariances = 2.0 * cylinders[:, 2], self._covariances(cylinders, on)
-        good = (count >= 3) & self._are_upright(on) & self._are_opaque(cylinders) & (misfit < detector.largest_misfit)
-        good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
-        # A fit to too few points locates the trunk no better than the cluster does.
-        good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (2.0 * detector.cell) ** 2
-        good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
-        self._good = good
-        R = rotations(clusters.bearings[good])
-        positions = origin + np.einsum("kij,kj->ki", R, cylinders[good, :2])
-        P = R @ covariances[good, :2, :2] @ R.transpose(0, 2, 1) + detector.position_floor**2 * np.eye(2)
-        deviations = np.hypot(2.0 * np.sqrt(covariances[good, 2, 2]), detector.diameter_floor)
-        return Landmarks(positions, P, diameters[good], deviations)
+        self._cylinders, self._points = cylinders, on
+        self._count = np.maximum(clusters.sums(on.astype(float)), 1.0)
+        self._misfit = clusters.sums(on * squares) / self._count
+        self._spread = np.sqrt(np.trace(self._covariances(outline=0.0)[:, :2, :2], axis1=1, axis2=2))
 
-    @property
-    def rest(self) -> Clusters:
-        """The clusters that `trunks` found no trunk in."""
-        return self._clusters.select(~self._good)
+    def is_possible(self) -> NDArray[np.bool_]:
+        """Return whether the fits have the size of a trunk, and locate it, (k,)."""
+        detector, diameters = self._detector, 2.0 * self._cylinders[:, 2]
+        possible = (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
+        # A fit to too few points locates the trunk no better than the cluster does.
+        possible &= (self._count >= 3) & (self._spread < 2.0 * detector.cell)
+        return possible
+
+    def probable(self, evidence: TrunkEvidence) -> NDArray[np.bool_]:
+        """Return whether the cylinders are trunks by their probabilities, (k,)."""
+        return evidence.probabilities() >= self._detector.least_probability
+
+    def apart(self, evidence: TrunkEvidence) -> NDArray[np.bool_]:
+        """Return whether the cylinders in a planar scan are opaque and round, (k,)."""
+        return (evidence.opacity > _OPAQUE) & (evidence.misfit < _LARGEST_MISFIT)
+
+    def landmarks(self, origin: Array, rows: NDArray[np.bool_], probabilities: Array) -> Landmarks:
+        """Return some of the cylinders as landmarks.
+
+        Args:
+            origin: The place of the scanner, (2,).
+            rows: A mask of the cylinders, (k,).
+            probabilities: The probabilities of these to be trunks.
+        """
+        detector, cylinders = self._detector, self._cylinders[rows]
+        covariances = self._covariances(outline=detector.outline)[rows]
+        R = rotations(self._clusters.bearings[rows])
+        positions = origin + np.einsum("kij,kj->ki", R, cylinders[:, :2])
+        P = R @ covariances[:, :2, :2] @ R.transpose(0, 2, 1) + detector.position_floor**2 * np.eye(2)
+        deviations = np.hypot(2.0 * np.sqrt(covariances[:, 2, 2]), detector.diameter_floor)
+        return Landmarks(positions, P, 2.0 * cylinders[:, 2], deviations, probabilities)
+
+    def evidence(self) -> TrunkEvidence:
+        """Return the measures of the cylinders."""
+        opacity, clutter = self._surroundings()
+        return TrunkEvidence(
+            opacity,
+            self._uprightness(),
+            self._misfit,
+            clutter,
+            self._roundness(),
+            self._hidden.any(axis=1).astype(float),
+            self._spread,
+        )
 
     def _start(self) -> tuple[Array, NDArray[np.bool_]]:
         """Return first cylinders (k, 5), and which points may be on them (n,)."""
@@ -318,41 +380,64 @@ class _CylinderFits:
         on[:, 1:-1] = on[:, 1:-1] | on[:, 2:] | on[:, :-2]
         return near & on.ravel()[place], nearest
 
-    def _are_opaque(self, cylinders: Array) -> NDArray[np.bool_]:
-        """Return whether rays towards the cylinders (k, 5) end on them, (k,): foliage lets some pass."""
-        scene, step = self._clusters.scene, self._detector.azimuth_step
+    def _surroundings(self) -> tuple[Array, Array]:
+        """Return the opacity and the clutter of the cylinders, (k,) each, see `TrunkEvidence`."""
+        scene, step, cylinders = self._clusters.scene, self._detector.azimuth_step, self._cylinders
+        k, radii = len(cylinders), cylinders[:, 2]
+        owners, at = self._rays_near(_BESIDE[0] * radii + _BESIDE[1] + _STRIP)
+        azimuth = scene.azimuths[at] - self._clusters.bearings[owners]
+        z = scene.heights[at] - self._detector.reference_height
+        x, y, r, lx, ly = cylinders[owners].T
+        x, y, c, s = x + lx * z, y + ly * z, np.cos(azimuth), np.sin(azimuth)
+        aside, ahead = y * c - x * s, x * c + y * s
+        errors = scene.distances[at] - (ahead - np.sqrt(np.maximum(r**2 - aside**2, 0.0)))
+        inner = (np.abs(aside) < _INNER * r) & (errors > -_SURROUNDINGS)
+        on = inner & (np.abs(errors) < _GATE * np.sqrt(self._variance + (_DEPTH * r) ** 2))
+        beyond = np.abs(aside) - (_BESIDE[0] * r + _BESIDE[1] + 0.5 * step * x)
+        near = (beyond > 0.0) & (beyond < _STRIP) & (np.abs(scene.distances[at] - ahead) < r + _NEAR)
+        rays, hits, clutter = (np.bincount(owners[mask], minlength=k).astype(float) for mask in (inner, on, near))
+        density = np.maximum(hits, _NEGLIGIBLE) / (2.0 * _INNER * radii)
+        return hits / np.maximum(rays, 1.0), clutter / (2.0 * _STRIP) / density
+
+    def _rays_near(self, widths: Array) -> tuple[Indices, Indices]:
+        """Return pairs of a cylinder and a point of the slice whose ray passes its axis within a width, (k,) in m."""
+        scene = self._clusters.scene
         low, high = self._detector.heights
         rows = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
         rows = rows[scene.azimuths[rows].argsort()]
         azimuths = scene.azimuths[rows]
-        bearings = self._clusters.bearings
-        x, y, r, _, ly = cylinders.T
-        half = np.arcsin(np.minimum(r / x, 0.95)) + np.abs(ly) * (high - low) / x + step
-        middle = wrap(bearings + np.arctan2(y, x))
+        x, y, _, _, ly = self._cylinders.T
+        half = np.arcsin(np.minimum(widths / x, 0.95)) + np.abs(ly) * (high - low) / x + self._detector.azimuth_step
+        middle = wrap(self._clusters.bearings + np.arctan2(y, x))
         turns = 2.0 * np.pi * np.arange(-1.0, 2.0)[:, None]
         begins = np.searchsorted(azimuths, (middle - half + turns).ravel())
-        ends = np.searchsorted(azimuths, (middle + half + turns).ravel())
-        lengths = ends - begins
+        lengths = np.searchsorted(azimuths, (middle + half + turns).ravel()) - begins
         owners = np.repeat(np.tile(np.arange(len(x)), 3), lengths)
-        at = rows[np.arange(lengths.sum()) + np.repeat(begins - np.cumsum(lengths) + lengths, lengths)]
-        azimuth, z = scene.azimuths[at] - bearings[owners], scene.heights[at] - self._detector.reference_height
-        x, y, r, lx, ly = cylinders[owners].T
-        x, y, c, s = x + lx * z, y + ly * z, np.cos(azimuth), np.sin(azimuth)
-        sine = (y * c - x * s) / r
-        errors = scene.distances[at] - (x * c + y * s - r * np.sqrt(np.maximum(1.0 - sine**2, 0.0)))
-        inner = (np.abs(sine) < _INNER) & (errors > -_SURROUNDINGS)
-        on = inner & (np.abs(errors) < _GATE * np.sqrt(self._variance + (_DEPTH * r) ** 2))
-        rays, hits = (np.bincount(owners[mask], minlength=len(cylinders)) for mask in (inner, on))
-        return hits > _OPAQUE * rays
+        return owners, rows[np.arange(lengths.sum()) + np.repeat(begins - np.cumsum(lengths) + lengths, lengths)]
 
-    def _are_upright(self, on: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return whether the points of the cylinders, a mask (n,), are in enough layers of the slice, (k,)."""
+    def _uprightness(self) -> Array:
+        """Return in how many layers of the slice the points of each cylinder are, over the layers with rays, (k,)."""
         detector, clusters = self._detector, self._clusters
         filled = np.zeros((len(clusters.starts), _LAYERS), dtype=bool)
         layers = _layers(self._heights + detector.reference_height, detector)
-        filled[clusters.owners[on], layers[on]] = True
-        passed = _passed(clusters.scene, clusters.rows, detector)
-        return filled.sum(axis=1) >= detector.upright_share * clusters.sums(passed) / clusters.counts
+        filled[clusters.owners[self._points], layers[self._points]] = True
+        passed = clusters.sums(_passed(clusters.scene, clusters.rows, detector)) / clusters.counts
+        uprightness: Array = filled.sum(axis=1) / np.maximum(passed, _NEGLIGIBLE)
+        return uprightness
+
+    def _roundness(self) -> Array:
+        """Return by how much the points are nearer to the cylinder than to a flat face, see `TrunkEvidence`, (k,)."""
+        clusters, on = self._clusters, self._points.astype(float)
+        terms = np.stack([clusters.distances, clusters.distances * self._sines, self._heights], axis=1)
+        terms -= (clusters.sums(on[:, None] * terms) / self._count[:, None])[clusters.owners]
+        distances, terms = terms[:, 0], terms[:, 1:]
+        normal = clusters.sums(on[:, None, None] * terms[:, :, None] * terms[:, None, :]) + 1e-6 * np.eye(2)
+        face = np.linalg.solve(normal, clusters.sums((on * distances)[:, None] * terms)[:, :, None])[:, :, 0]
+        flat = distances - (terms * face[clusters.owners]).sum(axis=1)
+        round_ = self._errors(self._cylinders)[0]
+        flat, round_ = (clusters.sums(on * errors**2) / self._count for errors in (flat, round_))
+        noise = 0.25 * self._variance
+        return np.log((flat + noise) / (round_ + noise))
 
     def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
         """Return a mask of the points on the cylinders (n,), and their weighted squared errors (n,).
@@ -416,8 +501,9 @@ class _CylinderFits:
         improved[:, 0] = np.maximum(improved[:, 0], 1.05 * improved[:, 2])
         return improved
 
-    def _covariances(self, cylinders: Array, on: NDArray[np.bool_]) -> Array:
-        """Return the covariances of the parameters, (k, 5, 5)."""
+    def _covariances(self, *, outline: float) -> Array:
+        """Return the covariances of the parameters, (k, 5, 5), with an outline in m as `TrunkDetectorConfig` has it."""
+        cylinders, on = self._cylinders, self._points
         _, weights, derivatives = self._errors(cylinders)
         weighted = derivatives * (weights * on)[:, None]
         _, J, weight = self._constraints(cylinders, on)
@@ -426,7 +512,7 @@ class _CylinderFits:
         # The covariance of the gradient: grazing rays have less weight than their variance would give them, and edges,
         # which no number of rays makes better, have more.
         spread = self._clusters.sums(weighted[:, :, None] * weighted[:, None, :] * self._variance)
-        edges = J[:, :2] * (weight[:, :2] * self._detector.outline / cylinders[:, :1])[:, :, None]
+        edges = J[:, :2] * (weight[:, :2] * outline / cylinders[:, :1])[:, :, None]
         spread += np.einsum("kmi,kmj->kij", edges, edges)
         covariances: Array = inverse @ (spread + prior) @ inverse
         return covariances
