@@ -38,8 +38,6 @@ from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearanc
 ORDER = "bspline"
 RESTING = 2
 """The number of equal knots at each end of a plan, for a rate of zero there."""
-REACH = 1.2
-"""The largest distance of a free knot from the straight path, in rad: it keeps the space of search small."""
 
 # Steps of the integration for each piece of the curve.
 _STEPS_PER_PIECE = 6
@@ -103,13 +101,14 @@ class MoveSpace:
 
     @cached_property
     def functions(self) -> tuple[casadi.Function, casadi.Function]:
-        """Return (z, ends) -> cost, g and (z, ends) -> cost, its gradient, g, its Jacobian.
+        """Return (z, p) -> cost, g and (z, p) -> cost, its gradient, g, its Jacobian.
 
-        z are the free knots, shape (7 k,), knot by knot; ends the start and the goal, shape (14,). The cost is
-        4 sin^2(q / 2), which is q^2 for small q, in rad^2; g are the constraints of `bounds`.
+        z are the free knots, shape (7 k,), knot by knot; p is `Move.numbers`, shape (15,). The cost is 4 sin^2(q / 2),
+        which is q^2 for small q, plus the weight times its mean over the move, in rad^2; g are the constraints of
+        `bounds`, which begin with 4 sin^2 of half the deviation at the end of each step.
         """
-        z, ends = casadi.MX.sym("z", ARM_JOINTS * self.free), casadi.MX.sym("ends", 2 * ARM_JOINTS)
-        start, goal = ends[:ARM_JOINTS], ends[ARM_JOINTS:]
+        z, p = casadi.MX.sym("z", ARM_JOINTS * self.free), casadi.MX.sym("p", 2 * ARM_JOINTS + 1)
+        start, goal, weight = p[:ARM_JOINTS], p[ARM_JOINTS:-1], p[-1]
         knots = casadi.horzcat(start, start, casadi.reshape(z, ARM_JOINTS, self.free), goal, goal)
         rotation = self.reaction.function(knots)[0]
         deviation = 4.0 * casadi.sum1(rotation[1:, 1:] ** 2).T
@@ -121,9 +120,11 @@ class MoveSpace:
         torques /= casadi.DM(limits)
         rates = knots @ casadi.DM(self.spline.bezier(1).T) / casadi.DM(self.servicer.speeds)
         clear = self.arm.soft.map(len(self._watched))(knots @ casadi.DM(self.spline.matrix(self._watched).T))
-        cost = deviation[-1]
+        # The deviations at the ends of the steps, in the cost.
+        shares = casadi.vertcat(casadi.repmat(weight / self.steps, self.steps - 1, 1), 1.0 + weight / self.steps)
+        cost = casadi.dot(shares, deviation)
         g = casadi.vertcat(deviation, casadi.vec(torques), casadi.vec(rates), casadi.vec(clear))
-        value = casadi.Function("arm_move", [z, ends], [cost, g], ["z", "ends"], ["cost", "g"])
+        value = casadi.Function("arm_move", [z, p], [cost, g], ["z", "p"], ["cost", "g"])
         # The deviation follows from the velocities at the ends and in the middles of the steps.
         halves = np.linspace(0.0, self.spline.duration, 2 * self.steps + 1)
         at, rate = (knots @ casadi.DM(self.spline.matrix(halves, k).T) for k in range(2))
@@ -137,7 +138,7 @@ class MoveSpace:
             casadi.jacobian(casadi.vec(rates), z),
             self._slope(self.arm.soft, knots, self._watched, 1),
         )
-        return value, casadi.Function("arm_move_slopes", [z, ends], [cost, turned[-1, :].T, g, slope])
+        return value, casadi.Function("arm_move_slopes", [z, p], [cost, turned.T @ shares, g, slope])
 
     def _slope(self, function: casadi.Function, knots: Expression, times: Array, count: int) -> Expression:
         """Return the Jacobian of a function of a plan by its free knots, shape (m p, 7 k).
@@ -217,6 +218,8 @@ class Move:
         space: The moves of that duration.
         start: Joint positions in rad, shape (7,).
         goal: Joint positions in rad, shape (7,).
+        turn: The largest deviation that a plan may have on the way, as a share of the straight path's largest.
+        weight: The weight of the mean over the move of the squared deviation, beside the one at the end.
 
     Raises:
         ValueError: The arm is closer than `CLEARANCE` to base, panels or itself at the start or at the goal.
@@ -225,6 +228,8 @@ class Move:
     space: MoveSpace
     start: Array
     goal: Array
+    turn: float = 1.0
+    weight: float = 0.0
 
     def __post_init__(self) -> None:
         for name, q in (("start", self.start), ("goal", self.goal)):
@@ -236,9 +241,9 @@ class Move:
                 )
 
     @property
-    def ends(self) -> Array:
-        """Return start and goal, shape (14,)."""
-        return np.concatenate([self.start, self.goal])
+    def numbers(self) -> Array:
+        """Return start, goal and the weight, shape (15,)."""
+        return np.concatenate([self.start, self.goal, [self.weight]])
 
     @cached_property
     def straight(self) -> Array:
@@ -253,8 +258,8 @@ class Move:
 
     @property
     def largest(self) -> float:
-        """Return the largest deviation on the straight path, in rad, which no plan may exceed."""
-        return float(self.straight_motion.angle.max())
+        """Return the largest deviation that a plan may have, in rad."""
+        return self.turn * float(self.straight_motion.angle.max())
 
     def knots(self, z: ArrayLike) -> Array:
         """Return all knots, shape (n, 7), of the free ones, shape (7 k,)."""
@@ -263,10 +268,9 @@ class Move:
 
     @property
     def search_range(self) -> tuple[Array, Array]:
-        """Return the ends of the free knots, two of shape (7 k,): the joints' limits, and `REACH`; in rad."""
-        straight, servicer = self.straight[RESTING:-RESTING], self.space.servicer
-        lower, upper = np.maximum(straight - REACH, servicer.lower), np.minimum(straight + REACH, servicer.upper)
-        return lower.ravel(), upper.ravel()
+        """Return the ends of the free knots, two of shape (7 k,): the joints' limits, in rad."""
+        servicer, free = self.space.servicer, self.space.free
+        return np.tile(servicer.lower, free), np.tile(servicer.upper, free)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -300,17 +304,18 @@ class Move:
         return {name: float(value) for name, value in excesses.items() if not value <= 1e-9}
 
     def touched(self, knots: Array) -> list[str]:
-        """Return the limits that a plan, shape (n, 7), uses to 99 %, by the names of `excess`, and ``reach``.
+        """Return the limits that a plan, shape (n, 7), uses to 99 %, by the names of `excess`.
 
-        For rates and clearance they are those that solvers keep, and ``reach`` is `REACH`.
+        For rates and clearance they are those that solvers keep.
         """
         servicer, motion = self.space.servicer, self.motion(knots)
+        middle, half = 0.5 * (servicer.upper + servicer.lower), 0.5 * (servicer.upper - servicer.lower)
         used = {
+            "position": np.max(np.abs(np.array(self.space.spline.extremes(knots)) - middle) / half),
             "rate": np.max(np.abs(self.space.spline.extremes(knots, 1)) / servicer.speeds) / _RATE_SHARE,
             "torque": np.max(np.abs(motion.torque) / np.array(servicer.torques)),
             "deviation": motion.angle.max() / self.largest,
             "clearance": (CLEARANCE + _MARGIN) / self.space.clearance(knots),
-            "reach": np.abs(knots - self.straight).max() / REACH,
         }
         return [name for name, share in used.items() if share >= 0.99]
 

@@ -21,7 +21,6 @@ from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, Solve
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
-from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS
 from vtbdrake_diagrams.satellite.studies.arm_move import FEASIBILITY, RESTING, Move, move_space
 
 GOOD_ENOUGH = 2e-3
@@ -69,15 +68,16 @@ class _Best:
         self._begin, self._move = time.perf_counter(), move
         self._lower, self._upper = move.bounds
         self.z: Array | None = None
-        self.deviation = inf
+        self.cost = self.deviation = inf
         self.history: list[tuple[float, float]] = []
 
     def look(self, z: Array, cost: float, g: Array) -> None:
-        """Take note of a point with its cost 4 sin^2(q / 2) and its constraints."""
+        """Take note of a point with its cost and its constraints, see `MoveSpace.functions`."""
         beyond = max(np.max(self._lower - g), np.max(g - self._upper))
-        q = 2.0 * np.arcsin(min(np.sqrt(max(cost, 0.0)) / 2.0, 1.0))
-        if beyond <= FEASIBILITY and q < self.deviation and not self._move.excess(self._move.knots(z)):
-            self.z, self.deviation = np.array(z), float(q)
+        if beyond <= FEASIBILITY and cost < self.cost and not self._move.excess(self._move.knots(z)):
+            end = g[self._move.space.steps - 1]
+            self.z, self.cost = np.array(z), cost
+            self.deviation = float(2.0 * np.arcsin(min(np.sqrt(max(end, 0.0)) / 2.0, 1.0)))
             self.history.append((time.perf_counter() - self._begin, self.deviation))
 
 
@@ -116,7 +116,7 @@ def _plan(move: Move, method: _Method, attempts: int) -> Plan:
     best, message = _Best(move), "no attempt was made"
     for attempt in range(attempts):
         message = method(move, start_of(move, attempt), best)
-        if best.deviation <= good_enough(move):
+        if best.cost <= _cost(good_enough(move)):
             break
     z = move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
     return Plan(move.knots(z), best.deviation, tuple(best.history), message)
@@ -127,6 +127,11 @@ def good_enough(move: Move) -> float:
     return min(GOOD_ENOUGH, GOOD_SHARE * float(move.straight_motion.angle[-1]))
 
 
+def _cost(deviation: float) -> float:
+    """Return the cost of a plan that ends with a deviation in rad, if nothing but the end counts."""
+    return float(4.0 * np.sin(deviation / 2.0) ** 2)
+
+
 def start_of(move: Move, attempt: int) -> Array:
     """Return where a solver starts, shape (7 k,), in rad: near the straight path, the same for all solvers."""
     straight = move.straight[RESTING:-RESTING].ravel()
@@ -135,12 +140,12 @@ def start_of(move: Move, attempt: int) -> Array:
 
 
 def _by_casadi(move: Move, start: Array, best: _Best) -> str:
-    z, ends = casadi.MX.sym("z", start.size), casadi.MX.sym("ends", move.ends.size)
+    z, p = casadi.MX.sym("z", start.size), casadi.MX.sym("p", move.numbers.size)
     value, slopes = move.space.functions
     # Inlined, the cost is computed without the constraints.
-    cost, g = value.call([z, ends], True, False)
-    gradient, slope = casadi.gradient(cost, z), slopes(z, ends)[3]
-    watch = _Watch(best, start.size, g.numel())
+    cost, g = value.call([z, p], True, False)
+    gradient, slope = casadi.gradient(cost, z), slopes(z, p)[3]
+    watch = _Watch(best, x=start.size, f=1, g=g.numel(), lam_x=start.size, lam_g=g.numel(), lam_p=p.numel())
     options = {
         "ipopt.hessian_approximation": "limited-memory",
         "ipopt.tol": _TOLERANCE,
@@ -150,15 +155,13 @@ def _by_casadi(move: Move, start: Array, best: _Best) -> str:
         "ipopt.sb": "yes",
         "print_time": False,
         "iteration_callback": watch,
-        "grad_f": casadi.Function(
-            "grad_f", [z, ends], [_SCALE * cost, _SCALE * gradient], ["x", "p"], ["f", "grad_f_x"]
-        ),
-        "jac_g": casadi.Function("jac_g", [z, ends], [g, slope], ["x", "p"], ["g", "jac_g_x"]),
+        "grad_f": casadi.Function("grad_f", [z, p], [_SCALE * cost, _SCALE * gradient], ["x", "p"], ["f", "grad_f_x"]),
+        "jac_g": casadi.Function("jac_g", [z, p], [g, slope], ["x", "p"], ["g", "jac_g_x"]),
     }
-    solver = casadi.nlpsol("arm_plan", "ipopt", {"x": z, "p": ends, "f": _SCALE * cost, "g": g}, options)
+    solver = casadi.nlpsol("arm_plan", "ipopt", {"x": z, "p": p, "f": _SCALE * cost, "g": g}, options)
     lower, upper = move.search_range
     least, most = move.bounds
-    solution = solver(x0=start, p=move.ends, lbx=lower, ubx=upper, lbg=least, ubg=most)
+    solution = solver(x0=start, p=move.numbers, lbx=lower, ubx=upper, lbg=least, ubg=most)
     best.look(solution["x"].full().ravel(), float(solution["f"]) / _SCALE, solution["g"].full().ravel())
     return str(solver.stats()["return_status"])
 
@@ -166,10 +169,9 @@ def _by_casadi(move: Move, start: Array, best: _Best) -> str:
 class _Watch(casadi.Callback):
     """Is shown each iterate of CasADi's solver, and stops it at the target."""
 
-    def __init__(self, best: _Best, variables: int, constraints: int) -> None:
+    def __init__(self, best: _Best, **sizes: int) -> None:
         super().__init__()
-        self._best = best
-        self._sizes = {"x": variables, "f": 1, "g": constraints, "lam_x": variables, "lam_g": constraints}
+        self._best, self._sizes = best, sizes
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
@@ -179,12 +181,12 @@ class _Watch(casadi.Callback):
         return 1
 
     def get_sparsity_in(self, i: int) -> casadi.Sparsity:
-        return casadi.Sparsity.dense(self._sizes.get(casadi.nlpsol_out(i), 2 * ARM_JOINTS), 1)
+        return casadi.Sparsity.dense(self._sizes[casadi.nlpsol_out(i)], 1)
 
     def eval(self, arg: Sequence[Any]) -> list[Any]:
         x, f, g = (arg[i].full().ravel() for i in range(3))
         self._best.look(x, float(f[0]) / _SCALE, g)
-        return [int(self._best.deviation <= _TARGET)]
+        return [int(self._best.cost <= _cost(_TARGET))]
 
 
 _DRAKE: dict[str, tuple[type[SolverInterface], dict[str, float]]] = {
@@ -209,7 +211,7 @@ def _by_drake(solver: SolverInterface, options: dict[str, float], move: Move, st
         key = z.tobytes()
         if key not in evaluations:
             evaluations.clear()
-            cost, gradient, g, jacobian = (value.full() for value in slopes(z, move.ends))
+            cost, gradient, g, jacobian = (value.full() for value in slopes(z, move.numbers))
             best.look(z, float(cost[0, 0]), g.ravel())
             evaluations[key] = _SCALE * float(cost[0, 0]), _SCALE * gradient.ravel(), g.ravel(), jacobian
         return evaluations[key]

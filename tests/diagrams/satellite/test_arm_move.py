@@ -42,23 +42,27 @@ def test_straight_path_keeps_the_limits_and_lies_on_a_line(move):
     assert np.all(np.abs(move.space.spline.matrix([0.0, 20.0], 1) @ move.straight) < 1e-12)
 
 
-def test_cost_and_constraints_are_those_of_the_motion(move):
-    knots = bent(move, 0.2)
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+def test_cost_and_constraints_are_those_of_the_motion(move, weight):
+    knots, move = bent(move, 0.2), replace(move, weight=weight)
     value, _ = move.space.functions
-    cost, g = (found.full().ravel() for found in value(knots[2:-2].ravel(), move.ends))
+    cost, g = (found.full().ravel() for found in value(knots[2:-2].ravel(), move.numbers))
     motion = move.motion(knots)
-    assert cost[0] == pytest.approx(4.0 * np.sin(motion.angle[-1] / 2.0) ** 2)
-    np.testing.assert_allclose(g[: move.space.steps], 4.0 * np.sin(motion.angle[1:] / 2.0) ** 2, atol=1e-12)
+    squares = 4.0 * np.sin(motion.angle[1:] / 2.0) ** 2
+    assert cost[0] == pytest.approx(squares[-1] + weight * squares.mean())
+    np.testing.assert_allclose(g[: move.space.steps], squares, atol=1e-12)
     torques = (motion.torque[::3] / Servicer().torques).ravel()
     np.testing.assert_allclose(g[move.space.steps :][: torques.size], torques, atol=1e-12)
 
 
-def test_slopes_are_those_of_finite_differences(move):
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+def test_slopes_are_those_of_finite_differences(move, weight):
+    move = replace(move, weight=weight)
     value, slopes = move.space.functions
     z, h = bent(move, 0.2)[2:-2].ravel(), 1e-6
     way = np.random.default_rng(3).standard_normal(z.size)
-    above, below = (value(z + sign * h * way, move.ends) for sign in (1.0, -1.0))
-    _, gradient, _, jacobian = (found.full() for found in slopes(z, move.ends))
+    above, below = (value(z + sign * h * way, move.numbers) for sign in (1.0, -1.0))
+    _, gradient, _, jacobian = (found.full() for found in slopes(z, move.numbers))
     assert gradient.ravel() @ way == pytest.approx(float(above[0] - below[0]) / (2.0 * h), rel=1e-5)
     difference = (above[1] - below[1]).full().ravel() / (2.0 * h)
     np.testing.assert_allclose(jacobian @ way, difference, atol=1e-6)
@@ -69,7 +73,7 @@ def test_bounds_agree_with_the_limits(move):
     least, most = move.bounds
     for scale in (0.05, 0.4, 1.0, 2.0):
         knots = bent(move, scale, seed=4)
-        g = move.space.functions[0](knots[2:-2].ravel(), move.ends)[1].full().ravel()
+        g = move.space.functions[0](knots[2:-2].ravel(), move.numbers)[1].full().ravel()
         excess = {name for name in move.excess(knots) if name != "position"}
         if ((least <= g) & (g <= most)).all():
             assert not excess
