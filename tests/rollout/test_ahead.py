@@ -123,15 +123,15 @@ def test_rollouts_that_kill_their_workers_have_two_tries_each(always, treacherou
 
 
 def _slow(theta):
-    time.sleep(0.75)
+    time.sleep(1.5)
     return abs(theta)
 
 
 @pytest.mark.slow
 def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
-    # Each has two samples, of 1.5 s together, and has stood behind another one.
+    # Each has two samples, of 3 s together, and has stood behind another one.
     task = RolloutTask(PendulumScenario(), 0.5, Quality(_slow, THETA), sample_period=0.5)
-    with ProcessExecutor(1, time_limit=2.9) as executor:
+    with ProcessExecutor(1, time_limit=5.9) as executor:
         list(executor.run(TASK, _points(1)))
         assert _watched(executor, task, _points(3))[1] == 2
     assert caplog.text == ""
