@@ -1,4 +1,4 @@
-"""What the deviations of the base at the end, at most and in the mean cost each other."""
+"""The front of a plan: deviations of the base at the end, at most and in the mean, which cost each other."""
 
 import numpy as np
 import pytest
