@@ -5,8 +5,8 @@
 kykleung/RFS-SLAM. (Guivant and Nebot, "Optimization of the simultaneous localization and map-building algorithm for
 real-time implementation", IEEE Transactions on Robotics and Automation 17, 2001.)
 
-Positions by satellites of the first half calibrate the odometry, and tell where the map lies. Those of the second half
-judge, and do nothing else.
+Positions by satellites of the first half calibrate the odometry, and tell where the map lies. Trees and wheels of that
+half calibrate the direction of the scanner. Positions of the second half judge, and do nothing else.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
+from vtbdrake.components.localization.planar import compose, inverse, rotation, rotations, transform, wrap
 from vtbdrake.components.localization.range_bearing import range_bearing_landmarks
 from vtbdrake.components.localization.steering import SteeringConfig, bicycle_motion
 from vtbdrake.components.localization.unit import TRACKING
@@ -57,6 +57,10 @@ _DEVIATIONS = 3.0
 _SAME_TREE = 1.5
 # A detection within this distance of a tree shows it, in m.
 _MATCHES = 0.6
+# The wheels and the survey are compared over this number of scans, about a second.
+_SCANS_AHEAD = 5
+# A survey whose motion differs more than this from the wheels' jumps, in m.
+_SURVEY_JUMP = 0.5
 # The time in s after which a scan is answered: before the next one.
 _ANSWERED = 0.2
 
@@ -157,6 +161,26 @@ def laid_onto(points: Array, targets: Array) -> Array:
     a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
     turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
     return np.array([*(targets.mean(axis=0) - rotation(turn) @ points.mean(axis=0)), turn])
+
+
+def slide(mapped: Survey, odometry: Array) -> float:
+    """Return how far left of its heading by the survey the car moves, in rad: so far right the scanner is turned.
+
+    Wheels that do not slip roll along the heading; where the odometry's origin is off the axle, it slides in turns.
+
+    Args:
+        mapped: The survey.
+        odometry: The poses by dead reckoning at the times of the survey, (n, 3).
+    """
+    moved, expected = (
+        np.array([compose(inverse(a), b) for a, b in zip(path, path[_SCANS_AHEAD:], strict=False)])
+        for path in (mapped.poses, odometry)
+    )
+    off = moved[:, :2] - expected[:, :2]
+    # Where the survey jumps, it is wrong.
+    is_usual = np.hypot(*off.T) < _SURVEY_JUMP
+    terms = np.column_stack([expected[:, 0], wrap(moved[:, 2])])
+    return float(np.linalg.lstsq(terms[is_usual], off[is_usual, 1], rcond=None)[0][0])
 
 
 def surveyed(drive: Drive, scenario: ParkScenario, config: SurveyConfig) -> Survey:
@@ -333,7 +357,7 @@ class Prepared:
     """The calibration and the map that the first part of a drive gives.
 
     Attributes:
-        scenario: The scenario with the calibrated car.
+        scenario: The scenario with the calibrated car and scanner.
         config: The settings of surveys, with the calibrated place of the antenna.
         mapped: The survey.
         noise: Standard deviation of positions by satellites about the survey, in m per axis.
@@ -360,11 +384,15 @@ class Prepared:
 
 
 def prepared(first: Drive) -> Prepared:
-    """Calibrate the car and survey the trees with the first part of a drive."""
+    """Calibrate the car and its scanner, and survey the trees, with the first part of a drive."""
     scenario = ParkScenario()
     car, antenna = calibrated(first, scenario.car)
     scenario = replace(scenario, car=car)
     config = SurveyConfig(antenna_x=float(antenna[0]), antenna_y=float(antenna[1]))
+    mapped = surveyed(first, scenario, config)
+    turned = slide(mapped, reckoned(first.log.sense["odometry"], car, mapped.times))
+    detector = replace(scenario.detector, heading=scenario.detector.heading - turned)
+    scenario = replace(scenario, detector=detector)
     mapped = surveyed(first, scenario, config)
     positions = first.steady_positions
     off = mapped.antenna_at(positions[:, 0], config) - positions[:, 1:]
@@ -386,7 +414,8 @@ def main(folder: Path, speed: float, plot: Path | None) -> None:
     print(f"first half, {start:.0f} to {middle:.0f} s: {len(first.positions)} positions by satellites")
     print(
         f"  odometry: speed x {car.speed_scale:.4f}, steering x {car.steering_scale:.4f} + "
-        f"{car.steering_offset:.5f} rad; antenna at {half.antenna[0]:.2f}, {half.antenna[1]:.2f} m"
+        f"{car.steering_offset:.5f} rad; antenna at {half.antenna[0]:.2f}, {half.antenna[1]:.2f} m; "
+        f"scanner turned by {np.degrees(half.scenario.detector.heading):.2f} deg"
     )
     print(
         f"  map: {len(trees)} trees, deviation {np.median(deviations):.2f} m, shared over "

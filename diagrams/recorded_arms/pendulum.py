@@ -24,6 +24,15 @@ HORIZON = 0.3
 """Duration of a prediction, in s."""
 IDENTIFICATION = "control_method_pd/system_identification"
 HELD_OUT = {"energy shaping": "control_method_energy_shaping", "iLQR": "control_method_ilqr"}
+RANGES = {
+    f"{BODY}.center_of_mass[2]": (-1.5, -0.02),
+    f"{BODY}.inertia[1]": (1e-4, 0.3),
+    f"{DRIVES}.viscous[0]": (0.0, 0.5),
+    f"{DRIVES}.coulomb[0]": (0.0, 1.0),
+}
+"""The numbers that are calibrated, with their ranges."""
+FIT_PERIOD = 0.02
+"""The time between two positions of the fit, in s."""
 # A window is predicted if its largest speed exceeds this one, in rad/s.
 _SLOWEST = 1.0
 # Steps of the integration within a period of a published model: its friction is steep.
@@ -32,7 +41,6 @@ _SUBSTEPS = 4
 _STEEP = 0.02
 # Duration over which velocities are smoothed, in s.
 _SMOOTHED = 0.06
-_FIT_PERIOD = 0.02
 
 
 @dataclass
@@ -101,7 +109,11 @@ WEIGHED = 0.6755, 0.5
 
 def recordings(folder: Path, name: str) -> Log:
     """Return one of the recorded runs."""
-    path = folder / "results" / name / "data_measured.csv"
+    return read(folder / "results" / name / "data_measured.csv")
+
+
+def read(path: Path) -> Log:
+    """Return the run of a file."""
     sense = {"joint_position": "position", "joint_velocity": "velocity"}
     return vtb.read_table(path, sense=sense, act={"torque": "torque"})
 
@@ -111,22 +123,16 @@ def calibrated(log: Log) -> tuple[Calibration, PendulumModel]:
 
     With the mass at its guess, centre and moment say all that a pendulum depends on.
     """
-    ranges = {
-        f"{BODY}.center_of_mass[2]": (-1.5, -0.02),
-        f"{BODY}.inertia[1]": (1e-4, 0.3),
-        f"{DRIVES}.viscous[0]": (0.0, 0.5),
-        f"{DRIVES}.coulomb[0]": (0.0, 1.0),
-    }
     result = calibrate(
         TorqueLimitedPendulumScenario(),
         log,
-        [vtb.Parameter(address, *ends) for address, ends in ranges.items()],
+        [vtb.Parameter(address, *ends) for address, ends in RANGES.items()],
         position="joint_position",
         torque="torque",
         measured_torque=True,
-        period=_FIT_PERIOD,
+        period=FIT_PERIOD,
     )
-    center, moment, viscous, coulomb = (result.parameters[address].value for address in ranges)
+    center, moment, viscous, coulomb = (result.parameters[address].value for address in RANGES)
     mass = TorqueLimitedPendulumScenario().mass
     return result, PendulumModel(moment + mass * center**2, -mass * center, viscous, coulomb)
 

@@ -80,16 +80,21 @@ def _split(each: RegressionEquations, parts: int) -> tuple[tuple[RegressionEquat
 # -- Franka's Panda
 
 
-def panda(folder: Path) -> Subject:
-    """Franka's Panda (C. Gaz and others, RA-L 2019): 21 s at 1 kHz, torques by the joints' sensors."""
+def panda_recording(folder: Path) -> JointRecording:
+    """Return the recording of Franka's Panda: 21 s at 1 kHz, torques by the joints' sensors."""
     log = folder / "matlab/data/Exciting_Traj/Trajectory_1/rbt_log"
     times = np.loadtxt(log / "exciting_traj_time.txt")
     q, tau = (np.loadtxt(log / f"exciting_traj_{name}.txt").reshape(-1, 7) for name in ("positions", "torques"))
+    # There is one time more than positions.
+    return JointRecording("panda", times[: len(q)], q, tau)
+
+
+def panda(folder: Path) -> Subject:
+    """Franka's Panda (C. Gaz and others, RA-L 2019)."""
     # Behind the gears, the sensors do not feel the rotors.
     drives = {f"link{k + 1}": DriveModel(row, friction(rotor=False)) for k, row in enumerate(np.eye(7))}
     model = TorqueRegressor(plants.panda(), drives=drives)
-    # There is one time more than positions.
-    each = equations(model, JointRecording("panda", times[: len(q)], q, tau), cutoff=25.0, band=8.0)
+    each = equations(model, panda_recording(folder), cutoff=25.0, band=8.0)
     law = (0.54615, 0.87224, 0.64068, 1.2794, 0.83904, 0.30301, 0.56489)
     shift = (0.039533, 0.025882, -0.04607, 0.036194, 0.026226, -0.021047, 0.0035526)
     steep = (5.1181, 9.0657, 10.136, 5.5903, 8.3469, 17.133, 10.336)
@@ -121,24 +126,25 @@ _TX40_FIGAROH = {
 }  # fmt: skip
 
 
-def tx40(folder: Path) -> Subject:
-    """Staubli's TX40 (FIGAROH): 9 s at 5 kHz, motor positions and torques.
-
-    Motor 6 turns with joints 5 and 6, and so does its friction.
-    """
+def tx40_recording(folder: Path) -> JointRecording:
+    """Return the recording of Staubli's TX40: 9 s at 5 kHz, motor positions and torques, as those of the joints."""
     data = folder / "staubli_TX40/data"
     motor, torque = (np.loadtxt(data / f"{name}_data.csv", delimiter=",", skiprows=1) for name in ("pos_read", "curr"))
     gears = np.diag(_TX40_GEARS)
     gears[5, 4] = _TX40_GEARS[5]
     q = np.linalg.solve(gears, motor.T).T + np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
+    return JointRecording("tx40", _TX40_PERIOD * np.arange(len(q), dtype=float), q, torque @ gears)
+
+
+def tx40(folder: Path) -> Subject:
+    """Staubli's TX40 (FIGAROH): motor 6 turns with joints 5 and 6, and so does its friction."""
     names = [f"link{k + 1}" for k in range(6)]
     drives = {
         name: DriveModel(row, friction(coulomb_velocity=0.03)) for name, row in zip(names, np.eye(6), strict=True)
     }
     drives["wrist"] = DriveModel(np.array([0, 0, 0, 0, 1.0, 1.0]), friction(coulomb_velocity=0.03, offset=False))
     model = TorqueRegressor(plants.tx40(), drives=drives)
-    recording = JointRecording("tx40", _TX40_PERIOD * np.arange(len(q)), q, torque @ gears)
-    each = equations(model, recording, cutoff=100.0, band=12.0)
+    each = equations(model, tx40_recording(folder), cutoff=100.0, band=12.0)
     return Subject(
         "TX40",
         model,
@@ -153,19 +159,24 @@ def tx40(folder: Path) -> Subject:
 
 # -- TIAGo
 
+_TIAGO_DATA = "tiago/data/identification/dynamic"
 _TIAGO_GEARS = np.array([1.0, 100.0, 100.0, 100.0, 100.0, 336.0, 336.0, 336.0])
 _TIAGO_MOTORS = np.array([1.0, 0.136, 0.136, -0.087, -0.087, -0.0613, -0.0613, -0.0613])
 
 
-def tiago(folder: Path) -> Subject:
-    """PAL Robotics' TIAGo (FIGAROH): lift and arm, 80 s at 100 Hz, positions and currents."""
-    data = folder / "tiago/data/identification/dynamic"
+def tiago_recording(folder: Path) -> JointRecording:
+    """Return the recording of PAL Robotics' TIAGo, lift and arm: 80 s at 100 Hz, positions and currents."""
+    data = folder / _TIAGO_DATA
     position, effort = (
         np.loadtxt(data / f"tiago_{name}.csv", delimiter=",", skiprows=1) for name in ("position", "effort")
     )
-    tau = effort[:, 1:] * _TIAGO_GEARS * _TIAGO_MOTORS
-    model = TorqueRegressor(plants.tiago())
-    each = equations(model, JointRecording("tiago", position[:, 0], position[:, 1:], tau), cutoff=4.0, band=2.0)
+    return JointRecording("tiago", position[:, 0], position[:, 1:], effort[:, 1:] * _TIAGO_GEARS * _TIAGO_MOTORS)
+
+
+def tiago(folder: Path) -> Subject:
+    """PAL Robotics' TIAGo (FIGAROH)."""
+    data, model = folder / _TIAGO_DATA, TorqueRegressor(plants.tiago())
+    each = equations(model, tiago_recording(folder), cutoff=4.0, band=2.0)
     fitted, held_out = (each.between(9.0, 48.0),), (each.between(48.0, 68.0),)
     published = {
         "FIGAROH": _tiago_figaroh(model, data / "tiago_bp_19_Oct_2024_2320.csv"),
@@ -205,22 +216,28 @@ def _tiago_figaroh(model: TorqueRegressor, path: Path) -> Prediction:
 _KR300_COULOMB = 2e-4  # rad/s; friction changes as steeply as that, as its designers say, too
 
 
-def kr300(folder: Path) -> dict[str, Subject]:
-    """KUKA's KR300 R2500 (J. Weigand and others, 2021): three movements of 10 s at 250 Hz, each held out once.
-
-    The torques are the motors'. A hydraulic spring on axis 2 carries a part of the weight.
-    """
-    law = friction(coulomb_velocity=_KR300_COULOMB)
-    drives = {f"axis{k + 1}": DriveModel(row, law) for k, row in enumerate(np.eye(6))}
-    drives["spring"] = DriveModel(np.eye(6)[1], {"torque": lambda angle, rate, acceleration: kr300_spring(angle)})
-    model = TorqueRegressor(plants.kr300(), drives=drives)
+def kr300_recordings(folder: Path) -> list[JointRecording]:
+    """Return the three movements of KUKA's KR300: 10 s at 250 Hz, torques by the motors."""
     movements = []
     for path in sorted(folder.glob("recorded_trajectories/*/data.mat")):
         content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
         record, gears = content["rec"], content["para"].u
         q = np.radians(record.act_pos_mot_deg.T) + np.array([0.0, -np.pi / 2, np.pi, 0.0, 0.0, 0.0])
-        recording = JointRecording(path.parent.name, record.time_cont, q, record.act_torque_abs_nm.T * gears)
-        movements.append(equations(model, recording, cutoff=20.0, band=6.0))
+        torques = record.act_torque_abs_nm.T * gears
+        movements.append(JointRecording(path.parent.name, record.time_cont, q, torques))
+    return movements
+
+
+def kr300(folder: Path) -> dict[str, Subject]:
+    """KUKA's KR300 R2500 (J. Weigand and others, 2021): three movements, each held out once.
+
+    A hydraulic spring on axis 2 carries a part of the weight.
+    """
+    law = friction(coulomb_velocity=_KR300_COULOMB)
+    drives = {f"axis{k + 1}": DriveModel(row, law) for k, row in enumerate(np.eye(6))}
+    drives["spring"] = DriveModel(np.eye(6)[1], {"torque": lambda angle, rate, acceleration: kr300_spring(angle)})
+    model = TorqueRegressor(plants.kr300(), drives=drives)
+    movements = [equations(model, each, cutoff=20.0, band=6.0) for each in kr300_recordings(folder)]
     return {
         letter: Subject(
             f"KR300, movement {letter}",
@@ -268,8 +285,8 @@ _GO2_KD = 1.5
 _GO2_LEGS = ("FL", "FR", "RL", "RR")
 
 
-def go2(folder: Path) -> dict[str, Subject]:
-    """Unitree's Go2 (IIT's DLS lab): it hangs, and its legs follow a chirp for 23 s at 200 Hz.
+def go2_recordings(folder: Path) -> list[JointRecording]:
+    """Return the recordings of the legs of Unitree's Go2, which hangs: a chirp of 23 s at 200 Hz.
 
     The torques were not recorded: they follow from the drives' controllers, kp (q_d - q) - kd v.
     """
@@ -278,13 +295,21 @@ def go2(folder: Path) -> dict[str, Subject]:
             np.frombuffer(archive.read(f"traj_0/data/{k}"), np.float32).astype(float).reshape(-1, size)
             for k, size in enumerate((1, 12, 12))
         )
+    torques = _GO2_KP * (desired - q) - _GO2_KD * np.gradient(q, times[:, 0], axis=0)
+    spans = [slice(3 * k, 3 * k + 3) for k in range(len(_GO2_LEGS))]
+    return [
+        JointRecording(leg, times[:, 0], q[:, span], torques[:, span])
+        for leg, span in zip(_GO2_LEGS, spans, strict=True)
+    ]
+
+
+def go2(folder: Path) -> dict[str, Subject]:
+    """Return the legs of Unitree's Go2 (IIT's DLS lab)."""
     legs = {}
-    for k, name in enumerate(_GO2_LEGS):
+    for recording in go2_recordings(folder):
+        name = recording.source
         model = TorqueRegressor(plants.go2_leg(1.0 if name.endswith("L") else -1.0))
-        mine = slice(3 * k, 3 * k + 3)
-        v = np.gradient(q[:, mine], times[:, 0], axis=0)
-        tau = _GO2_KP * (desired[:, mine] - q[:, mine]) - _GO2_KD * v
-        each = equations(model, JointRecording(name, times[:, 0], q[:, mine], tau), cutoff=20.0, band=10.0)
+        each = equations(model, recording, cutoff=20.0, band=10.0)
         public = {
             f"{joint}.{term}": value
             for joint in plants.GO2_JOINTS

@@ -19,6 +19,8 @@ UNDETERMINED = 0.5
 _ITERATIONS = 25
 # The last iteration moves the parameters by less than this, in units of their scales.
 _CONVERGED = 1e-3
+# Joints are loaded whose torques are at least this share of the largest ones, as root mean squares.
+_LOADED = 0.2
 # Number of samples left out at each end of a recording, where smoothed positions are bad.
 _ENDS = 15
 # Between the ends, every third sample is taken.
@@ -31,12 +33,16 @@ class TorqueFit(NamedTuple):
     Attributes:
         z: The parameters.
         unexplained: What is left of the torques, (n, nq).
-        share: The share of the power of the torques that is not explained; about 1 of nothing, 0 of everything.
+        share: The share of the power of the torques that is not explained, the mean over the joints; about 1 of
+            nothing, 0 of everything.
+        loaded_share: The same without joints whose torques are small beside the largest ones: these may all be lost in
+            the friction of a joint that hardly moves.
     """
 
     z: Array
     unexplained: Array
     share: float
+    loaded_share: float
 
 
 class InverseDynamics:
@@ -101,7 +107,8 @@ class InverseDynamics:
         # By joint, as a wrist's torques are small beside a shoulder's; a passive joint has the torques of its motion.
         power = np.maximum((acting**2).mean(axis=0), ((e + acting) ** 2).mean(axis=0))
         shares = (e**2).mean(axis=0) / np.maximum(power, 1e-12)
-        return TorqueFit(z, e, float(shares.mean()))
+        is_loaded = power >= _LOADED**2 * power.max()
+        return TorqueFit(z, e, float(shares.mean()), float(shares[is_loaded].mean()))
 
     def torque_factors(self, recordings: Sequence[JointRecording], z: Array) -> Array:
         """Return by which factor the torques of each actuator would explain the motion best, (nu,).

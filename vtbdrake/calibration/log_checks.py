@@ -13,12 +13,13 @@ from math import pi
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vtbdrake.calibration.filtering import JointRecording, stale
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
 from vtbdrake.calibration.joint_model import CalibrationError, JointModel
 from vtbdrake.common.argument_checks import counted
-from vtbdrake.common.arrays import Array
+from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.recording.log import GAP, Log, Series
 from vtbdrake.testbed import Interface
@@ -31,13 +32,17 @@ _UNEVEN = 0.2
 _SATURATED = 0.05
 # An extreme value that this number of samples in a row have is a limit.
 _PLATEAU = 5
-# An extreme value that lasts this long comes from a dead sensor, in s.
+# A value that lasts this long while others change may come from a dead sensor, in s.
 _FROZEN = 0.5
+# The others change in more than this share of the samples.
+_MOSTLY = 0.5
+# It does if the first change afterwards is this number of usual changes: a joint that rested begins slowly.
+_LEAP = 10.0
 # Beyond this share of unexplained power, a model does not describe the recorded machine.
 UNLIKE = 0.5
 # Another reading of the columns is believed if it leaves at most this share of what the columns as they are leave.
 _BETTER = 1.0 / 9.0
-# It leaves at most this share of the power of the torques, too.
+# It, or a shift in time, leaves at most this share of the power of the torques, too.
 _EXPLAINED = 0.3
 # No other reading is looked for if the columns as they are leave less than this share of the power.
 _GOOD = 0.02
@@ -109,11 +114,11 @@ def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> 
             "of another clock?"
         )
     for k in range(q.values.shape[1]):
-        seconds = _longest_run(q.values[:, k], other_joints=np.delete(q.values, k, 1)) * q.uniformity.period
+        seconds = _longest_freeze(q.values[:, k], other_joints=np.delete(q.values, k, 1)) * q.uniformity.period
         if k not in dead and seconds > _FROZEN:
             remarks.append(
-                f"{log.source}: {position}[{k}] keeps one value for {seconds:.3g} s while another joint moves: a "
-                "sensor that was dead, or a joint that stuck"
+                f"{log.source}: {position}[{k}] keeps one value for {seconds:.3g} s while another joint moves, and "
+                "does not go on from there: a sensor that was dead"
             )
     for k in range(u.values.shape[1]):
         share, value = _plateau(u.values[:, k])
@@ -160,25 +165,34 @@ def _of_clock(label: str, series: Series) -> Iterator[str]:
         yield f"{label} comes unevenly: every {1e3 * period:.3g} ms, and half of the times {1e3 * jitter:.2g} ms off"
 
 
-def _longest_run(values: Array, *, other_joints: Array) -> int:
-    """Return the largest number of equal samples in a row during which one of these joints changes all the time."""
-    if not other_joints.shape[1]:
+def _longest_freeze(values: Array, *, other_joints: Array) -> int:
+    """Return the largest number of equal samples in a row, before a leap or the end, while others mostly change.
+
+    Args:
+        values: The positions of a joint, (n,).
+        other_joints: Those of the others, (n, nq - 1).
+    """
+    steps = abs(np.diff(values))
+    if not other_joints.shape[1] or not steps.any():
         return 0
+    leap = _LEAP * np.median(steps[steps > 0.0])
     moving = (np.diff(other_joints, axis=0) != 0.0).any(axis=1)
-    longest = run = 0
-    for same in (np.diff(values) == 0.0) & moving:
-        run = run + 1 if same else 0
-        longest = max(longest, run)
-    return longest
+    begins, ends = _runs(steps == 0.0).T
+    after = np.append(steps, np.inf)[ends]
+    moved = np.array([moving[a:b].mean() > _MOSTLY for a, b in zip(begins, ends, strict=True)], dtype=bool)
+    return int((ends - begins)[(after > leap) & moved].max(initial=0))
+
+
+def _runs(mask: NDArray[np.bool]) -> Indices:
+    """Return where the mask (n,) begins and ceases to be true, (m, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2)
 
 
 def _plateau(values: Array) -> tuple[float, float]:
     """Return the share of samples at an extreme value in long rows, and the value, of the worse of both ends."""
     shares = []
     for extreme in (values.min(), values.max()):
-        at = np.concatenate([[False], values == extreme, [False]])
-        ends = np.flatnonzero(np.diff(at.astype(int))).reshape(-1, 2)
-        lengths = ends[:, 1] - ends[:, 0]
+        lengths = np.diff(_runs(values == extreme))[:, 0]
         # A drive that rests commands nothing, which is no limit.
         count = lengths[lengths >= _PLATEAU].sum() if extreme != 0.0 and np.ptp(values) > 0.0 else 0
         shares.append((float(count) / len(values), float(extreme)))
@@ -233,17 +247,17 @@ def check_torques(
     if not model.varies_delay and not late:
         delays = {d: share_of(_delayed(d)) for d in (*_DELAYS, *(-each for each in _DELAYS)) if _fits(recordings, d)}
         d, least = min(delays.items(), key=lambda item: item[1], default=(0, share))
-        if least < _ALIGNED * share:
+        if least < _ALIGNED * share and least < _EXPLAINED:
             period = recordings[0].period
             remarks.append(
                 f"with torques that act {1e3 * abs(d) * period:.3g} ms {'later' if d > 0 else 'earlier'}, {least:.2g} "
                 f"of their power is not explained, instead of {share:.2g}: vary the delay of the drives, or check the "
                 "clocks"
             )
-    if fit.share > UNLIKE:
+    if fit.loaded_share > UNLIKE:
         doubts.append(
-            f"{fit.share:.0%} of the power of the torques is not explained by any parameters in these ranges: another "
-            "machine, other units, or a model that lacks the most"
+            f"{fit.loaded_share:.0%} of the power of the torques is not explained by any parameters in these ranges: "
+            "another machine, other units, torques that are mostly noise, or a model that lacks the most"
         )
     return Checks(tuple(remarks), tuple(doubts))
 
@@ -260,7 +274,8 @@ def currents(model: JointModel, dynamics: InverseDynamics, recordings: Sequence[
     for _ in range(_ROUNDS):  # Friction is told with the factors, and the factors without friction.
         factors = dynamics.torque_factors(recordings, z)
         scaled = [replace(each, u=factors * each.u) for each in recordings]
-        z, _, least = dynamics.fit(scaled, start=model.start, most=_SAMPLES)
+        fit = dynamics.fit(scaled, start=model.start, most=_SAMPLES)
+        z, least = fit.z, fit.share
     if max(abs(np.log(np.maximum(abs(factors), 1e-9)))) < np.log(_GAIN) or least > min(_BETTER * share, _EXPLAINED):
         return []
     listed = ", ".join(f"{factor:.3g}" for factor in factors)
@@ -299,7 +314,7 @@ def _late_column(
         for k in range(size)
     ]
     least, periods, side, k = min(shifts)
-    if least > _ALIGNED * share or least > _ALIGNED * together:
+    if least > _ALIGNED * min(share, together) or least > _EXPLAINED:
         return []
     name, shift = "position" if side == "q" else "torque", 1e3 * periods * recordings[0].period
     return [

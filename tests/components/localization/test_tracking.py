@@ -286,6 +286,32 @@ def test_right_maps_seem_no_more_distorted_than_by_chance(errors):
     assert distortions.max() < chi2.ppf(0.999, 6)
 
 
+@pytest.mark.parametrize(("told", "scatter"), [(0.05, (1.0, 1.4)), (0.02, (3.5, 6.5))])
+def test_scatter_is_how_much_worse_a_map_is_than_it_says(told, scatter):
+    """Errors of 0.05 m, all of them known: the corrections. (0.05 / 0.02)² is 6.25, less what is told."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-30.0, 30.0, (40, 2))
+    corrections = 0.05 * rng.normal(size=(40, 2)) + 0.01 * places
+    found = health.distortion(places, corrections, np.full(40, told**2))
+    assert scatter[0] <= found[1] < scatter[1]
+    assert found[0] > chi2.ppf(0.99999, 6)  # By 1 %, it is distorted all the same.
+    correlated = health.distortion(places, corrections, told**2 * np.eye(40))
+    assert correlated == pytest.approx(found)
+
+
+@pytest.mark.slow
+def test_map_that_is_worse_than_it_says_is_noticed_and_its_pose_less_certain():
+    """With a third of the true deviations, normalized squares of 27 are expected of a filter that believes them."""
+    squares, scatters = [], []
+    for seed in range(8):
+        one = drive(seed, REMOTE)
+        boasting = replace(one, map=replace(one.map, covariances=one.map.covariances / 9.0))
+        tracker, states = tracked(boasting)
+        squares.append(nees(states[-1].pose, tracker.pose_covariance(states[-1]), one.poses[-1]))
+        scatters.append(states[-1].scatter)
+    assert np.median(scatters) > 1.5 and np.mean(squares) < 13.5, (scatters, squares)
+
+
 def distorted(landmarks, displacement):
     """Return the map with displacements by a function of the positions (n, 2)."""
     places = landmarks.positions
@@ -309,7 +335,7 @@ def test_distorted_maps_make_the_pose_doubtful(kind):
     assert not any(right.is_doubtful(state) for state in rights)
     # Before there is doubt, the covariance grows.
     larger = [np.trace(tracker.pose_covariance(s)) / np.trace(s.pose_covariance) for s in states]
-    ratios = [max(1.0, state.distortion / chi2.ppf(0.95, 6)) for state in states]
+    ratios = [state.scatter * max(1.0, state.distortion / chi2.ppf(0.95, 6)) for state in states]
     np.testing.assert_allclose(larger, ratios)
     assert max(ratios) > 1.5
 

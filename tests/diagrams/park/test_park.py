@@ -19,10 +19,11 @@ from vtbdrake_diagrams.park.reality import (
     localized,
     prepared,
     reckoned,
+    slide,
     victoria_park,
 )
 from vtbdrake_diagrams.park.scenario import PERIOD
-from vtbdrake_diagrams.park.survey import SurveyConfig, survey
+from vtbdrake_diagrams.park.survey import Survey, SurveyConfig, survey
 
 pytestmark = pytest.mark.one_python
 
@@ -90,6 +91,19 @@ def test_points_are_laid_onto_others_by_a_rigid_motion():
     np.testing.assert_allclose(laid_onto(points, transform(X, points)), X)
 
 
+def test_turned_scanner_makes_the_car_slide():
+    """A survey with a scanner that is turned by 0.02 rad to the right, and an origin 0.1 m ahead of the axle."""
+    rng, n, turned, ahead = np.random.default_rng(0), 200, 0.02, np.array([0.1, 0.0, 0.0])
+    headings = np.cumsum(0.05 * np.sin(0.1 * np.arange(n)))
+    places = np.cumsum(0.4 * np.column_stack([np.cos(headings), np.sin(headings)]), axis=0)
+    axle = np.column_stack([places, headings])
+    seen = np.array([compose(pose, ahead) for pose in axle]) - [0.0, 0.0, turned] + 0.005 * rng.normal(size=(n, 3))
+    nothing = Landmarks.empty()
+    assert slide(Survey(np.arange(n), seen, nothing, 0.0), axle) == pytest.approx(turned, abs=0.002)
+    seen[100:] += [1.0, -1.0, 0.0]  # A jump is left out.
+    assert slide(Survey(np.arange(n), seen, nothing, 0.0), axle) == pytest.approx(turned, abs=0.002)
+
+
 @pytest.fixture(scope="module")
 def drive():
     return victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
@@ -103,6 +117,8 @@ def half(drive):
 @pytest.mark.slow
 def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path, drive, half):
     """The end of the drive is where it began. The whole: python -m vtbdrake_diagrams.park.reality."""
+    # The second half of the drive shows the same: see docs/reality_drives.md.
+    assert np.degrees(half.scenario.detector.heading) == pytest.approx(-1.05, abs=0.15)
     end = drive.between(1477.0, 1500.0)
     found, report = localized(end, half.with_map(tmp_path), tmp_path / "drive.lcm")
     assert report.identical

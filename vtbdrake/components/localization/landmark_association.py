@@ -105,24 +105,25 @@ class Association:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions[self.usable]))
 
-    def nearby(self, X_WH: Array, covariance: Array, detections: Landmarks) -> Indices:
+    def nearby(self, X_WH: Array, covariance: Array, detections: Landmarks, *, scatter: float) -> Indices:
         """Return the landmarks of the map that can be within the gate of a detection.
 
         Args:
             X_WH: The pose of the carrier, (3,).
             covariance: The covariance P of the pose, (3, 3).
             detections: The detections, in H, with their noise.
+            scatter: The factor of the variances of the landmarks.
         """
         places = transform(X_WH, detections.positions)
         levers = (detections.positions**2).sum(axis=1)
         noise = np.trace(detections.covariances, axis1=1, axis2=2)
         spread = noise + covariance[0, 0] + covariance[1, 1] + levers * covariance[2, 2]
-        gate = chi_square_quantile(self.gate, 2)
-        around = self._tree.query_ball_point(places, np.sqrt(gate * (spread + self.variances.max())))
+        gate, variances = chi_square_quantile(self.gate, 2), scatter * self.variances
+        around = self._tree.query_ball_point(places, np.sqrt(gate * (spread + variances.max())))
         rows = np.repeat(np.arange(len(places)), [len(neighbours) for neighbours in around])
         near = np.concatenate([*around, []]).astype(np.intp)
         squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
-        return self.usable[np.unique(near[squares <= gate * (spread[rows] + self.variances[near])])]
+        return self.usable[np.unique(near[squares <= gate * (spread[rows] + variances[near])])]
 
     def matched(self, detections: Landmarks, expected: ExpectedDetections, *, field_of_view: float) -> MatchedPairs:
         """Return the matches of detections, in H with their noise, with those that are expected.

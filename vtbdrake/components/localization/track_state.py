@@ -36,11 +36,12 @@ class TrackState:
         evidence: Cumulative log-likelihood ratio of first matches.
         failures: The number of scans in succession that failed.
         distortion: The test statistic of a distorted map after the last scan that was fused.
+        scatter: The factor by which the variance of the map's errors seems larger than the map says, at least 1.
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
         unjudged: Numbers of detections and of matched ones, of landmarks that should be seen again and of seen ones,
             in the last scans, which together had too few to be judged, shape (2, 2).
 
-    The last five are the health of the track, see `vtbdrake.components.localization.health`.
+    The last six are the health of the track, see `vtbdrake.components.localization.health`.
     """
 
     mean: Array
@@ -50,6 +51,7 @@ class TrackState:
     evidence: float = 0.0
     failures: int = 0
     distortion: float = 0.0
+    scatter: float = 1.0
     drift: float = 1.0
     unjudged: Array = field(default_factory=lambda: np.zeros((2, 2)))
 

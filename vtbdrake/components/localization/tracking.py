@@ -317,7 +317,7 @@ class Tracker:
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
         factor = np.ones(m) if probability is None else _variance_within(self.first_gate) * probability**-2.0
         if self.correlation == 0.0:
-            prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances[indices]))
+            prior = block_diag(np.zeros((0, 0)), *((state.scatter * factor)[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
         else:
             M = self._map_errors(np.concatenate([state.indices, indices]))
@@ -326,7 +326,7 @@ class Tracker:
             if probability is not None:
                 # The variance of the error of each landmark, given the errors of all others, times the factor.
                 rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(M))[n:])
-            prior, J = np.kron(rest, np.eye(2)), np.kron(weights.T, np.eye(2))
+            prior, J = np.kron(state.scatter * rest, np.eye(2)), np.kron(weights.T, np.eye(2))
             added = places[indices] + weights.T @ (state.landmark_positions - places[state.indices])
         cross = J @ P[FIXED:]
         return state.with_arrays(
@@ -352,7 +352,7 @@ class Tracker:
     def _associate(self, state: TrackState, view: SensorView) -> MatchedPairs:
         """Return the matches of detections with the map around the pose of a state."""
         detections = view.landmarks
-        near = self._association.nearby(state.pose, state.pose_covariance, detections)
+        near = self._association.nearby(state.pose, state.pose_covariance, detections, scatter=state.scatter)
         if not len(near):
             return MatchedPairs.none()
         extended = self._extended(state, near[~np.isin(near, state.indices)])
@@ -396,8 +396,9 @@ class Tracker:
         far[np.argsort(distance)[self.most :]] = True
         near = fused.without(far)
         places = self.landmarks.positions[near.indices]
-        distortion = health.distortion(places, near.landmark_positions - places, self._map_errors(near.indices))
-        return replace(near, distortion=distortion), Matches(pairs, float(parts.sum()), is_fused=True)
+        M = self._map_errors(near.indices)
+        distortion, scatter = health.distortion(places, near.landmark_positions - places, M)
+        return replace(near, distortion=distortion, scatter=scatter), Matches(pairs, float(parts.sum()), is_fused=True)
 
     def _expected(self, state: TrackState, rows: Indices, *, is_scan: bool) -> tuple[Array, Array]:
         """Return the expected detections of landmarks of the state in H, (m, 2), and the derivatives (m, 2, 6).
