@@ -58,10 +58,10 @@ class RecordedArmScenario(TorqueDrivenScenario):
         return PLANTS[self.arm]().num_positions()
 
     def add_links(self, plant: MultibodyPlant) -> list[RevoluteJoint]:
-        given, joints = PLANTS[self.arm](), []
+        published, joints = PLANTS[self.arm](), []
         instance, parent = plant.AddModelInstance("arm"), plant.world_body()
-        for index in given.GetJointIndices():
-            joint = given.get_joint(index)
+        for index in published.GetJointIndices():
+            joint = published.get_joint(index)
             body = plant.AddRigidBody(joint.child_body().name(), instance, joint.child_body().default_spatial_inertia())
             X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
             mount = plant.AddFrame(FixedOffsetFrame(f"{joint.name()}_mount", parent.body_frame(), X_PF, instance))

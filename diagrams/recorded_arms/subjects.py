@@ -127,7 +127,7 @@ _TX40_FIGAROH = {
 
 
 def tx40_recording(folder: Path) -> JointRecording:
-    """Return the recording of Staubli's TX40: 9 s at 5 kHz, motor positions and torques, as those of the joints."""
+    """Return the recording of Staubli's TX40: 9 s at 5 kHz, by motors that turn the joints over gears."""
     data = folder / "staubli_TX40/data"
     motor, torque = (np.loadtxt(data / f"{name}_data.csv", delimiter=",", skiprows=1) for name in ("pos_read", "curr"))
     gears = np.diag(_TX40_GEARS)

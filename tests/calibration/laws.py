@@ -1,9 +1,12 @@
 """Verdicts about a pendulum of other laws of friction: ``python -m tests.calibration.laws`` prints a table.
 
-The pendulum is not made of the package's parts, and is calibrated with Coulomb and viscous friction.
+With names of laws as arguments, it prints these rows alone. The pendulum is not made of the package's parts, and is
+calibrated with Coulomb and viscous friction.
 """
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 
@@ -21,6 +24,7 @@ CAUSES = {
     "Stribeck": "its speed near rest",
     "direction": "the direction of its motion",
     "load": "its load",
+    "Dahl": "its way since it turned",
     "zero offset": "the encoder of",
 }
 
@@ -29,7 +33,7 @@ def main() -> None:
     """Print accepted and named recordings, coverage and errors for each law, without and with a disturbance."""
     names = [address.split(".")[-1] for address in VALUES]
     header = ("law", "disturbance", "accepted", "named", "right intervals", *names)
-    rows = [row(law, disturbance) for law in CAUSES for disturbance in DISTURBANCES]
+    rows = [row(law, disturbance) for law in sys.argv[1:] or CAUSES for disturbance in DISTURBANCES]
     print(text_table(header, rows))
     print("Errors are medians, of the truth.")
 

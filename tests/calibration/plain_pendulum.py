@@ -20,12 +20,16 @@ GRAVITY = 9.81  # m/s^2
 # (velocity in rad/s, torque in N m) -> the size of the friction beside the viscous one, in N m.
 Law = Callable[[float, float], float]
 
+# Dahl's friction has a memory: it rises over about this angle after each turn of the motion, in rad.
+DAHL_ANGLE = 0.1
+
 LAWS: dict[str, Law] = {
     "Coulomb": lambda v, torque: COULOMB,
     "Stribeck": lambda v, torque: COULOMB * (1.0 + 0.8 * np.exp(-((v / 0.3) ** 2))),
     "tolerance": lambda v, torque: COULOMB * (1.0 + 0.1 * np.exp(-((v / 0.3) ** 2))),
     "direction": lambda v, torque: COULOMB * (1.3 if v > 0.0 else 0.7),
     "load": lambda v, torque: 0.5 * COULOMB + 0.1 * abs(torque),
+    "Dahl": lambda v, torque: 0.0,
 }
 
 
@@ -93,7 +97,9 @@ def moved(
 ) -> Motion:
     """Return a motion of the pendulum.
 
-    Each step takes the friction implicitly: it never turns the velocity around.
+    Each step takes the friction implicitly: it never turns the velocity around. Dahl's friction f (P. Dahl, "A solid
+    friction model", Aerospace Corporation TOR-0158, 1968) is a spring that gives way: with the angle a, and F its
+    limit, df/dt = (F v - f |v|) / a.
 
     Args:
         law: Name of the friction's law.
@@ -114,15 +120,18 @@ def moved(
         walk[k] = decay * walk[k - 1] + np.sqrt(1.0 - decay**2) * rng.normal()
     acting = torques + disturbance * walk
     inertia = moment + MASS * center**2
-    q = v = 0.0
+    q = v = bristle = 0.0
     states = []
     for k in range(times.size):
         states.append((q, v))
         torque = acting[k - 1] if k else 0.0  # A command acts a period later, as with the testbed's drives.
         for _ in range(round(PERIOD / step)):
-            free = v + step * (torque - VISCOUS * v - MASS * GRAVITY * center * np.sin(q)) / inertia
+            held = torque - VISCOUS * v - MASS * GRAVITY * center * np.sin(q) - bristle
+            free = v + step * held / inertia
             friction = coulomb + LAWS[law](v, torque)
             v = np.sign(free) * max(abs(free) - step * friction / inertia, 0.0)
             q += step * v
+            if law == "Dahl":
+                bristle += step * (v * COULOMB - abs(v) * bristle) / DAHL_ANGLE
     positions, velocities = np.array(states).T
     return Motion(times, torques, positions, velocities, rng)

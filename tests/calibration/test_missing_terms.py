@@ -33,6 +33,7 @@ def test_right_law_is_accepted(seed: int) -> None:
     ("law", "dependence"),
     [
         ("load", "its load"),
+        pytest.param("Dahl", "its way since it turned", marks=pytest.mark.slow),
         pytest.param("direction", "the direction of its motion", marks=pytest.mark.slow),
         pytest.param("Stribeck", "its speed near rest", marks=pytest.mark.slow),
     ],

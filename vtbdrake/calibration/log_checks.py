@@ -166,7 +166,7 @@ def _of_clock(label: str, series: Series) -> Iterator[str]:
 
 
 def _longest_freeze(values: Array, *, other_joints: Array) -> int:
-    """Return the largest number of equal samples in a row, before a leap or the end, while others mostly change.
+    """Return the largest number of equal samples in a row, before a leap, while others mostly change.
 
     Args:
         values: The positions of a joint, (n,).
@@ -178,13 +178,13 @@ def _longest_freeze(values: Array, *, other_joints: Array) -> int:
     leap = _LEAP * np.median(steps[steps > 0.0])
     moving = (np.diff(other_joints, axis=0) != 0.0).any(axis=1)
     begins, ends = _runs(steps == 0.0).T
-    after = np.append(steps, np.inf)[ends]
+    after = np.append(steps, 0.0)[ends]
     moved = np.array([moving[a:b].mean() > _MOSTLY for a, b in zip(begins, ends, strict=True)], dtype=bool)
     return int((ends - begins)[(after > leap) & moved].max(initial=0))
 
 
 def _runs(mask: NDArray[np.bool]) -> Indices:
-    """Return where the mask (n,) begins and ceases to be true, (m, 2)."""
+    """Return begin and end of each part of a mask (n,) that is true, (m, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2)
 
 

@@ -29,6 +29,8 @@ SIGNIFICANT = 6.0
 SUSPECTED = 3.0
 # Torques below this share of a joint's friction, or its torques if it has no friction, are left to the disturbance.
 SHARE_OF_FRICTION = 0.15
+# A suspected term that is this share of a joint's friction is missed, too: the law of the friction is another one.
+MOST_OF_FRICTION = 0.4
 # The smallest offset of an encoder that is named, in rad or m.
 LEAST_OFFSET = 2e-3
 # An offset turns gravity by one number, as torques that depend on the position could by several: it comes first.
@@ -44,6 +46,8 @@ _LOST = 0.6
 # friction it is at least: the edge is the model's own simplification.
 _SLOW = (0.1, 0.3)
 _WIDER = 4.0
+# The shares of a joint's motion over which friction with a memory gives way.
+_PRESLIDING = (0.02, 0.05, 0.1)
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class MissingTerm:
     def is_named(self) -> bool:
         """Return whether the term is large and sure enough that the model is discrepant without it."""
         large = self.size > LEAST_OFFSET if self.is_offset else self.share > SHARE_OF_FRICTION
-        return large and self.significance > SIGNIFICANT
+        return (large and self.significance > SIGNIFICANT) or self.share > MOST_OF_FRICTION
 
     @property
     def rank(self) -> float:
@@ -211,6 +215,9 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
                 ],
                 "its speed (friction that is not linear in it)": [v * speed],
                 "its load (load_friction of the drives)": [sign * abs(load)],
+                "its way since it turned (friction with a memory)": [
+                    _with_memory(v, segments.period, share * np.ptp(q)) for share in _PRESLIDING
+                ],
                 "its position": [np.sin(q), np.cos(q), np.sin(2.0 * q), np.cos(2.0 * q)],
             }
             for dependence, torques in shapes.items():
@@ -220,6 +227,23 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
         unit[j] = 1.0
         # The model at q + offset, and back: what the positions become differs from the measured ones by the offset.
         yield name, "the zero of its encoder", 1.0, float("nan"), unit - linearized.A[..., j]
+
+
+def _with_memory(v: Array, period: float, angle: float) -> Array:
+    """Return friction of the size 1 that gives way over an angle, (N, W): df/dt = (v - f |v|) / angle (Dahl, 1968).
+
+    It has given way at the begin of each segment.
+
+    Args:
+        v: The velocities, (N, W), in rad/s or m/s.
+        period: The time from one to the next, in s.
+        angle: The angle or length, in rad or m.
+    """
+    friction, sign = np.sign(v), np.sign(v)
+    stays = np.exp(-abs(v) * period / angle)
+    for k in range(1, len(v)):
+        friction[k] = sign[k - 1] + (friction[k - 1] - sign[k - 1]) * stays[k - 1]
+    return friction
 
 
 def _rms(values: Array) -> float:

@@ -13,7 +13,7 @@ from vtbdrake.calibration.log_checks import check_log
 from vtbdrake.recording import Log, Series
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.recorded_arms.alarms import POSITION, TORQUE, Recorded, of_arm, of_double_pendulum
-from vtbdrake_diagrams.recorded_arms.subjects import go2_recordings
+from vtbdrake_diagrams.recorded_arms.subjects import go2_recordings, tx40_recording
 
 pytestmark = pytest.mark.one_python
 
@@ -37,6 +37,12 @@ def with_defect(each: Recorded, change: Callable[[np.ndarray, np.ndarray], Colum
 def test_real_double_pendulum_raises_no_alarm(number: int) -> None:
     share, alarms = double_pendulum(number).alarms()
     assert share > 0.5 and not alarms
+
+
+@pytest.mark.slow
+def test_joints_of_a_real_arm_that_rest_in_the_end_are_not_dead() -> None:
+    arm = of_arm("TX40", tx40_recording(recordings("figaroh")[0]))
+    assert check_log(arm.log, arm.scenario.interface(), position=POSITION, torque=TORQUE).remarks == ()
 
 
 def test_real_leg_raises_no_alarm() -> None:
