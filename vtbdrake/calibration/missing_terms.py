@@ -29,8 +29,9 @@ SIGNIFICANT = 6.0
 SUSPECTED = 3.0
 # Torques below this share of a joint's friction, or its torques if it has no friction, are left to the disturbance.
 SHARE_OF_FRICTION = 0.15
-# A suspected term that is this share of a joint's friction is missed, too: the law of the friction is another one.
+# A term that is this share of a joint's friction, which is then of another law, is missed at fewer deviations, too.
 MOST_OF_FRICTION = 0.4
+SIGNIFICANT_IF_MOST = 3.5
 # The smallest offset of an encoder that is named, in rad or m.
 LEAST_OFFSET = 2e-3
 # An offset turns gravity by one number, as torques that depend on the position could by several: it comes first.
@@ -81,7 +82,8 @@ class MissingTerm:
     def is_named(self) -> bool:
         """Return whether the term is large and sure enough that the model is discrepant without it."""
         large = self.size > LEAST_OFFSET if self.is_offset else self.share > SHARE_OF_FRICTION
-        return (large and self.significance > SIGNIFICANT) or self.share > MOST_OF_FRICTION
+        least = SIGNIFICANT_IF_MOST if self.share > MOST_OF_FRICTION else SIGNIFICANT
+        return large and self.significance > least
 
     @property
     def rank(self) -> float:
