@@ -73,7 +73,7 @@ def arm_trajectory(repeats: int = 10, searched: int = 30) -> list[Benchmark]:
             history.append((time.perf_counter() - begin, trial.value))
 
     study.run(rollouts=searched, executor="serial", callbacks=[look], progress=False)
-    plan = Plan(move.straight, history[-1][1], tuple(history), "")
+    plan = Plan(move, move.straight, history[-1][1], tuple(history), "")
     rows.append(_row("cma_es_testbed", plan, time.perf_counter() - begin, straight))
     return rows
 

@@ -8,7 +8,8 @@ is minimized is the base attitude deviation at the end,
 because it stays: total momentum is zero, so the base stops with the arm, and q is the error with which the capture
 begins, and which the attitude control has to take back. The deviation on the way passes; it is a constraint that it is
 at no time larger than the largest one on the straight path. (It cannot vanish, since the base reacts at once to every
-joint. But the arm can turn it back on the way, as a cat does that lands on its feet, so that q = 0.) Further
+joint. But the arm can turn it back on the way, as a cat does that lands on its feet, so that q = 0.) A move can have a
+lower limit there, `Move.turn`, and weigh the mean of the squared deviation beside q, `Move.weight`. Further
 constraints: the positions, rates and torques of the joints, and the arm keeps clear of base, panels and itself.
 
 The unknowns are the inner knots of a clamped B-spline in joint space; two equal knots at each end let it begin and end

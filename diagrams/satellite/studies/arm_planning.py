@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, replace
+from math import inf, isfinite
 from typing import Any
 
 import casadi
@@ -27,6 +27,11 @@ GOOD_ENOUGH = 2e-3
 """The deviation q at which no further start is tried, in rad."""
 GOOD_SHARE = 0.02
 """The deviation q at which no further start is tried, as a share of the deviation on the straight path."""
+
+CALM = 0.6
+"""The deviation on the way that a plan is to keep below if it can, as a share of the straight path's largest.
+
+It costs nearly nothing at the end, see ``arm_front``."""
 
 # The standard deviation of the starts from the straight path, in rad.
 _SPREAD = 0.2
@@ -45,12 +50,14 @@ class Plan:
     """A plan of the arm, and how it was found.
 
     Attributes:
+        move: The move, with the limits that were kept.
         knots: The knots in rad, shape (n, 7).
         deviation: The deviation q in rad by the momentum model; infinite if no plan within the limits was found.
         history: The best q so far in rad over the wall time in s: (time, q), each better than the one before.
         message: How the solver ended, in its own words.
     """
 
+    move: Move
     knots: Array
     deviation: float
     history: tuple[tuple[float, float], ...]
@@ -95,6 +102,17 @@ def plan_by_casadi(move: Move, *, attempts: int = 4) -> Plan:
     return _plan(move, _by_casadi, attempts)
 
 
+def plan_calmly(move: Move, *, attempts: int = 4) -> Plan:
+    """Return a plan by IPOPT that turns the base no farther on the way than `CALM`, or than the move's limit.
+
+    Args:
+        move: The move.
+        attempts: See `plan_by_casadi`.
+    """
+    plan = plan_by_casadi(replace(move, turn=CALM), attempts=attempts)
+    return plan if isfinite(plan.deviation) else plan_by_casadi(move, attempts=attempts)
+
+
 def plan_by_drake(move: Move, solver: str = "SNOPT", *, attempts: int = 4) -> Plan:
     """Return a plan by a solver of Drake's MathematicalProgram.
 
@@ -119,7 +137,7 @@ def _plan(move: Move, method: _Method, attempts: int) -> Plan:
         if best.cost <= _cost(good_enough(move)):
             break
     z = move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
-    return Plan(move.knots(z), best.deviation, tuple(best.history), message)
+    return Plan(move, move.knots(z), best.deviation, tuple(best.history), message)
 
 
 def good_enough(move: Move) -> float:
@@ -241,7 +259,8 @@ def _by_drake(solver: SolverInterface, options: dict[str, float], move: Move, st
 class MomentumDescent(Solver):
     """A method of a reasoner: its candidates are the plans that gradients on the momentum model lead to.
 
-    One candidate is proposed at a time, from the next start. The reasoner tries each in its mental testbed.
+    One candidate is proposed at a time, from the next start, every second one within the limit of `CALM`. The reasoner
+    tries each in its mental testbed.
 
     Args:
         search: The free knots.
@@ -275,10 +294,11 @@ class MomentumDescent(Solver):
         if self._attempt == self._attempts:
             self._end(False, f"none of {self._attempts} starts led to {self._good:.2g} rad")
             return []
-        best = _Best(self._move)
-        _by_casadi(self._move, start_of(self._move, self._attempt), best)
+        move = self._move if self._attempt % 2 else replace(self._move, turn=CALM)
+        best = _Best(move)
+        _by_casadi(move, start_of(move, self._attempt), best)
         self._attempt += 1
-        z = self._move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
+        z = move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
         ends = [parameter.ends for parameter in self.search.space]
         return [tuple(float(np.clip(value, *pair)) for value, pair in zip(z, ends, strict=True))]
 

@@ -36,7 +36,7 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import (
     limits,
 )
 from vtbdrake_diagrams.satellite.studies.arm_move import REACHING
-from vtbdrake_diagrams.satellite.studies.arm_planning import plan_by_casadi
+from vtbdrake_diagrams.satellite.studies.arm_planning import plan_calmly
 from vtbdrake_diagrams.satellite.studies.clearance import DrakeClearance
 
 if TYPE_CHECKING:
@@ -248,11 +248,11 @@ class Comparison:
 
 def compare(scenario: ArmMotionScenario) -> Comparison:
     """Return the straight path beside the best plan by the momentum model, or that decided on board."""
-    straight, move = simulate(replace(scenario, onboard=False)), scenario.move()
+    straight = simulate(replace(scenario, onboard=False))
     if scenario.onboard:
         return Comparison(straight, simulate(scenario))
-    knots = plan_by_casadi(move, attempts=_STARTS).knots
-    return Comparison(straight, simulate(scenario, knots), tuple(move.touched(knots)))
+    plan = plan_calmly(scenario.move(), attempts=_STARTS)
+    return Comparison(straight, simulate(scenario, plan.knots), tuple(plan.move.touched(plan.knots)))
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,13 @@ from vtbdrake_diagrams.satellite.bodies import Servicer
 from vtbdrake_diagrams.satellite.studies.arm_motion import PLAN, ArmMotionScenario, free_knots
 from vtbdrake_diagrams.satellite.studies.arm_move import REACHING, Move, MoveSpace, move_space
 from vtbdrake_diagrams.satellite.studies.arm_planning import (
+    CALM,
     GOOD_ENOUGH,
     MomentumDescent,
     good_enough,
     plan_by_casadi,
     plan_by_drake,
+    plan_calmly,
 )
 
 
@@ -98,10 +100,19 @@ def test_a_plan_has_a_free_knot():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solve", [pytest.param(plan_by_casadi, marks=pytest.mark.one_python), plan_by_drake])
+@pytest.mark.parametrize(
+    "solve",
+    [
+        pytest.param(plan_by_casadi, marks=pytest.mark.one_python),
+        pytest.param(plan_calmly, marks=pytest.mark.one_python),
+        plan_by_drake,
+    ],
+)
 def test_solvers_find_a_plan_that_turns_the_base_back(move, solve):
     plan = solve(move, attempts=1)
-    assert move.excess(plan.knots) == {}
+    assert plan.move.excess(plan.knots) == move.excess(plan.knots) == {}
+    assert plan.move.turn == (CALM if solve is plan_calmly else 1.0)
+    assert move.motion(plan.knots).angle.max() <= plan.move.turn * move.straight_motion.angle.max() + 1e-9
     assert plan.deviation == pytest.approx(move.motion(plan.knots).angle[-1], abs=1e-6)
     assert plan.deviation < 0.1 * move.motion(move.straight).angle[-1]
     assert plan.time_to(plan.deviation) == plan.history[-1][0]
