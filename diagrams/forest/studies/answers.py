@@ -153,15 +153,17 @@ def localization(full: bool) -> Answer:
 
 def _fused(forests: fusion.Forests) -> str:
     """Return what scanner and cameras in one filter gain, in words."""
-    each = {
-        condition: max((fusion.summary(forests, condition, name) for name in fusion.MAP_NAMES), key=lambda s: s.ratio)
+    worst = {
+        condition: max(
+            ratio for name in fusion.MAP_NAMES for ratio in fusion.summary(forests, condition, name).ratios.values()
+        )
         for condition in fusion.CONDITIONS
     }
-    ratios = ", ".join(f"{condition}: {worst.ratio:.2f}" for condition, worst in each.items())
+    ratios = ", ".join(f"{condition}: {ratio:.2f}" for condition, ratio in worst.items())
     verdict = "no worse" if fusion.holds(forests) else "WORSE"
     return (
         f"Scanner and cameras in one filter, in {len(forests)} other forests, are {verdict} than each alone. "
-        f"Error over the better one's, with the map where it is largest: {ratios}."
+        f"Error over each one's at common times, with the map and the sensor where it is largest: {ratios}."
     )
 
 

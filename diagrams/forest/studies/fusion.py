@@ -6,11 +6,12 @@ in `FILE` is not driven again. Three conditions are made from the same recording
 are, a scanner that sees `SHORT` m far only, as in dust or snow, and a scanner that is silent in the second half of the
 drive.
 
-The criteria, fixed before any of the forests from `SEED` on was driven: the error of the position over all sample times
-of the judged part at which the unit claims a pose (RMS over all forests), the share of these times with a pose, wrong
-claims as `drives` counts them, and the number of forests in which both sensors err less than the better one of the two.
-Both must be no worse than each alone under each condition and with each map (`Summary.is_no_worse`), and better in most
-forests under one of them.
+The criteria, fixed before any of the forests from `SEED` on was driven: the error of the position, RMS over all
+forests, at the sample times of the judged part at which both units claim a pose that are compared; the share of times
+with a pose; wrong claims as `drives` counts them; and the number of forests in which both sensors err less than each
+alone. Both must be no worse than each alone under each condition and with each map (`Summary.is_no_worse`), and better
+in most forests under one of them. (Errors over the times of each unit's own poses cannot be compared: a unit that loses
+its pose where it is hard errs less in the mean. A first campaign, from seed 700,000 on, was judged so.)
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from math import inf, nan
+from math import nan
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -29,13 +30,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import read_results, write_results
 
-SEED = 700_000
+SEED = 710_000
 """The seed of the first forest."""
 LENGTH = 20.0
 """The length of a drive in m."""
@@ -53,6 +55,8 @@ MAP_NAMES = ("accurate", "remote")
 """The maps with which the unit localizes."""
 SENSORS = {"scanner": "scanner", "cameras": "stereo", "both": "both"}
 """The perception of the scenario whose unit is used, by the name of the sensors."""
+ALONE = ("scanner", "cameras")
+"""The sensors that both are compared with."""
 
 
 def _as_it_is(view: SensorView, time: float, *, middle: float) -> SensorView:
@@ -110,6 +114,9 @@ class Error:
     Attributes:
         condition, map, sensors: Their names.
         rms: RMS error of the position in m, None without a pose.
+        common: RMS errors in m with these sensors, and with both, at the times at which both units have a pose; None if
+            there is none.
+        common_poses: The number of these times.
         poses: The number of sample times with a pose.
         samples: The number of sample times.
         wrong: The number of wrong claims.
@@ -119,6 +126,8 @@ class Error:
     map: str
     sensors: str
     rms: float | None
+    common: tuple[float, float] | None
+    common_poses: int
     poses: int
     samples: int
     wrong: int
@@ -148,18 +157,30 @@ def judged(drive: Drive, scenario: ForestScenario) -> list[Error]:
         scenario: Its scenario.
     """
     errors = []
-    for name, sensors in product(MAP_NAMES, SENSORS):
-        of = replace(scenario, perception=SENSORS[sensors], map=name)
-        unit = of.unit(of.global_map())
-        for condition in CONDITIONS:
-            counts = drive.times > (middle(drive) if condition == SILENT else STANDING)
-            track = localize(seen_by(drive, sensors, condition), unit)
-            is_claimed = track.is_localized & counts
-            distances = np.hypot(*(track.poses - drive.truth)[is_claimed, :2].T)
-            rms = float(np.sqrt((distances**2).mean())) if len(distances) else None
-            wrong = int((distances > 0.5 + 4.0 * MAPS[name].position).sum())
-            errors.append(Error(condition, name, sensors, rms, len(distances), int(counts.sum()), wrong))
+    for name, condition in product(MAP_NAMES, CONDITIONS):
+        counts = drive.times > (middle(drive) if condition == SILENT else STANDING)
+        distances = {
+            s: _distances(drive, replace(scenario, perception=SENSORS[s], map=name), s, condition)[counts]
+            for s in SENSORS
+        }
+        for sensors, of in distances.items():
+            is_claimed, is_common = np.isfinite(of), np.isfinite(of + distances["both"])
+            wrong = int((of[is_claimed] > 0.5 + 4.0 * MAPS[name].position).sum())
+            poses, common_poses = int(is_claimed.sum()), int(is_common.sum())
+            rms = _rms(of[is_claimed]) if poses else None
+            common = (_rms(of[is_common]), _rms(distances["both"][is_common])) if common_poses else None
+            errors.append(Error(condition, name, sensors, rms, common, common_poses, poses, len(of), wrong))
     return errors
+
+
+def _distances(drive: Drive, scenario: ForestScenario, sensors: str, condition: str) -> Array:
+    """Return the errors of the position in m at the sample times of a drive, NaN without a pose, shape (n,)."""
+    track = localize(seen_by(drive, sensors, condition), scenario.unit(scenario.global_map()))
+    return np.where(track.is_localized, np.hypot(*(track.poses - drive.truth)[:, :2].T), nan)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 @dataclass(frozen=True)
@@ -168,28 +189,27 @@ class Summary:
 
     Attributes:
         rms: RMS error of the position in m by sensors; NaN without a pose.
+        ratios: The RMS error with both sensors over the error with one of them, at the times at which both units have a
+            pose; only of sensors with such times.
         shares: The share of the sample times with a pose, by sensors.
         wrong: The number of wrong claims, by sensors.
-        better: The number of forests in which both sensors err less than the better one of the two.
+        better: The number of forests in which both sensors err less than each alone, at these times.
         forests: The number of forests.
     """
 
     rms: Mapping[str, float]
+    ratios: Mapping[str, float]
     shares: Mapping[str, float]
     wrong: Mapping[str, int]
     better: int
     forests: int
 
     @property
-    def ratio(self) -> float:
-        """The RMS error with both sensors over the error with the better one alone."""
-        return self.rms["both"] / float(np.nanmin([self.rms["scanner"], self.rms["cameras"]]))
-
-    @property
     def is_no_worse(self) -> bool:
         """Return whether both are no worse than each alone, in error, share of poses and wrong claims."""
         alone = max(self.shares["scanner"], self.shares["cameras"])
-        return self.ratio <= LARGEST_RATIO and self.shares["both"] >= alone - LOST_SHARE and not self.wrong["both"]
+        is_as_accurate = all(ratio <= LARGEST_RATIO for ratio in self.ratios.values())
+        return is_as_accurate and self.shares["both"] >= alone - LOST_SHARE and not self.wrong["both"]
 
 
 def holds(forests: Forests) -> bool:
@@ -210,17 +230,31 @@ def summary(forests: Forests, condition: str, name: str) -> Summary:
         ]
         for sensors in SENSORS
     }
-    least = {sensors: [inf if e.rms is None else e.rms for e in errors] for sensors, errors in by_sensors.items()}
-    alone = np.minimum(least["scanner"], least["cameras"])
     poses = {sensors: sum(e.poses for e in errors) for sensors, errors in by_sensors.items()}
     squares = {s: sum(e.poses * (e.rms or 0.0) ** 2 for e in errors) for s, errors in by_sensors.items()}
     return Summary(
         {s: float(np.sqrt(squares[s] / poses[s])) if poses[s] else nan for s in SENSORS},
+        {s: ratio for s in ALONE if (ratio := _ratio(by_sensors[s])) is not None},
         {s: poses[s] / sum(e.samples for e in errors) for s, errors in by_sensors.items()},
         {s: sum(e.wrong for e in errors) for s, errors in by_sensors.items()},
-        int((np.array(least["both"]) < alone).sum()),
+        sum(_errs_less(alone) for alone in zip(*(by_sensors[s] for s in ALONE), strict=True)),
         len(forests),
     )
+
+
+def _ratio(errors: Sequence[Error]) -> float | None:
+    """Return the RMS error with both sensors over the error with these, at common times of all forests."""
+    pairs = [(error.common_poses, *error.common) for error in errors if error.common is not None]
+    if not pairs:
+        return None
+    counts, alone, both = np.array(pairs).T
+    return float(np.sqrt((counts * both**2).sum() / (counts * alone**2).sum()))
+
+
+def _errs_less(alone: Sequence[Error]) -> bool:
+    """Return whether both sensors err less in a forest than each alone that has a pose there."""
+    pairs = [error.common for error in alone if error.common is not None]
+    return bool(pairs) and all(both < one for one, both in pairs)
 
 
 def report(forests: Forests) -> str:
@@ -228,9 +262,14 @@ def report(forests: Forests) -> str:
     rows = []
     for condition, name in product(CONDITIONS, MAP_NAMES):
         each = summary(forests, condition, name)
-        cells = [f"{each.rms[s]:.3f} m in {each.shares[s]:.0%}, {each.wrong[s]} wrong" for s in SENSORS]
-        rows.append((condition, name, *cells, f"{each.better} of {each.forests}"))
-    return table(("condition", "map", *SENSORS, "both better"), rows)
+        cells = [
+            f"{each.rms[s]:.3f} m in {each.shares[s]:.0%}, {each.wrong[s]} wrong" if each.shares[s] else "no pose"
+            for s in SENSORS
+        ]
+        ratios = [f"{each.ratios[s]:.2f}" if s in each.ratios else "-" for s in ALONE]
+        rows.append((condition, name, *cells, *ratios, f"{each.better} of {each.forests}"))
+    ratios = [f"both over {s}" for s in ALONE]
+    return table(("condition", "map", *SENSORS, *ratios, "both better"), rows)
 
 
 def load() -> dict[int, list[Error]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
+from vtbdrake_diagrams.forest.studies import fusion
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive
 from vtbdrake_diagrams.forest.studies.fusion import (
     CONDITIONS,
@@ -19,6 +22,7 @@ from vtbdrake_diagrams.forest.studies.fusion import (
     SHORT,
     Error,
     holds,
+    judged,
     middle,
     report,
     seen_by,
@@ -98,48 +102,69 @@ def test_conditions_take_away_what_they_say() -> None:
     assert [each.is_scan for each in seen_by(drive, "both", usual).landmarks[2]] == [True, False]
 
 
-def test_forests_in_which_both_are_better_are_counted() -> None:
-    def errors(**rms: float | None) -> list[Error]:
-        return [
-            Error(condition, name, sensors, value, 4 if value else 0, 8, 1 if sensors == "cameras" else 0)
-            for condition in CONDITIONS
-            for name in MAP_NAMES
-            for sensors, value in rms.items()
-        ]
+def errors_of(scanner: tuple[float, int], cameras: tuple[float, int], both: tuple[float, int]) -> list[Error]:
+    """Return the errors under all conditions, from the RMS in m and the poses, of 8 samples, of each.
 
+    Both have a pose whenever a sensor alone has one.
+    """
+    return [
+        Error(condition, name, sensors, rms if poses else None, (rms, both[0]) if poses else None, poses, poses, 8, 0)
+        for condition in CONDITIONS
+        for name in MAP_NAMES
+        for sensors, (rms, poses) in {"scanner": scanner, "cameras": cameras, "both": both}.items()
+    ]
+
+
+def test_forests_in_which_both_are_better_are_counted() -> None:
     forests = {
-        1: errors(scanner=0.1, cameras=0.3, both=0.09),
-        2: errors(scanner=0.1, cameras=0.05, both=0.06),
-        3: errors(scanner=0.2, cameras=None, both=0.1),
+        1: errors_of((0.1, 4), (0.3, 4), (0.09, 4)),
+        2: errors_of((0.1, 4), (0.05, 4), (0.06, 4)),
+        3: errors_of((0.2, 4), (nan, 0), (0.1, 4)),
     }
     each = summary(forests, "as it is", "remote")
     assert each.better == 2 and each.forests == 3
     assert each.rms["scanner"] == pytest.approx(np.sqrt((0.1**2 + 0.1**2 + 0.2**2) / 3.0))
     assert each.rms["cameras"] == pytest.approx(np.sqrt((0.3**2 + 0.05**2) / 2.0))
+    both_squared = 0.09**2 + 0.06**2 + 0.1**2
+    assert each.ratios["scanner"] == pytest.approx(np.sqrt(both_squared / (2 * 0.1**2 + 0.2**2)))
+    assert each.ratios["cameras"] == pytest.approx(np.sqrt((both_squared - 0.1**2) / (0.3**2 + 0.05**2)))
     assert each.shares == pytest.approx({"scanner": 12 / 24, "cameras": 8 / 24, "both": 12 / 24})
-    assert each.wrong == {"scanner": 0, "cameras": 3, "both": 0}
     assert "0.141 m in 50%, 0 wrong" in report(forests).splitlines()[2]
 
 
+def test_errors_are_compared_where_both_units_have_a_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scanner loses its pose in the second half, where it is hard; both go on, and err more there."""
+    times = STANDING + np.arange(1.0, 5.0)
+    drive = Drive(times, np.zeros((4, 3)), np.zeros((4, 3)), ((),) * 4)
+    alone, both = np.array([0.1, 0.1, nan, nan]), np.array([0.05, 0.05, 0.5, 1.0])
+    distances = {"scanner": alone, "cameras": np.full(4, nan), "both": both}
+    monkeypatch.setattr(fusion, "_distances", lambda drive, scenario, sensors, condition: distances[sensors])
+    scanner, cameras, together = (
+        error for error in judged(drive, SCENARIO) if (error.condition, error.map) == ("as it is", "accurate")
+    )
+    assert scanner.common == pytest.approx((0.1, 0.05)) and (scanner.common_poses, scanner.poses) == (2, 2)
+    assert cameras.rms is None and cameras.common is None and cameras.poses == 0
+    assert together.rms == pytest.approx(np.sqrt((2 * 0.05**2 + 0.5**2 + 1.0) / 4)) and together.poses == 4
+    assert (scanner.wrong, together.wrong) == (0, 1)
+
+
 @pytest.mark.parametrize(
-    ("both", "is_good"),
+    ("changed", "is_good"),
     [
         ({}, True),
-        ({"rms": 0.106}, False),
+        ({"common": (0.1, 0.106)}, False),
         ({"poses": 7}, False),
         ({"wrong": 1}, False),
-        ({"rms": 0.1}, False),  # no worse, but better nowhere
+        ({"common": (0.1, 0.1)}, False),  # no worse, but better nowhere
     ],
 )
-def test_each_part_of_the_fusion_can_fail(both: dict[str, Any], is_good: bool) -> None:
-    scanner = {"rms": 0.1, "poses": 8, "samples": 8, "wrong": 0}
-    errors = []
-    for condition in CONDITIONS:
-        for name in MAP_NAMES:
-            changed = both if (condition, name) == ("as it is", "remote") or both == {"rms": 0.1} else {}
-            errors.append(Error(condition, name, "scanner", **scanner))
-            errors.append(Error(condition, name, "cameras", **scanner | {"rms": 0.3}))
-            errors.append(Error(condition, name, "both", **scanner | {"rms": 0.09} | changed))
+def test_each_part_of_the_fusion_can_fail(changed: dict[str, Any], is_good: bool) -> None:
+    errors = errors_of((0.1, 8), (0.3, 8), (0.09, 8))
+    everywhere = changed.get("common") == (0.1, 0.1)
+    for k, error in enumerate(errors):
+        here = everywhere or (error.condition, error.map) == ("as it is", "remote")
+        if here and error.sensors == ("scanner" if "common" in changed else "both"):
+            errors[k] = replace(error, **changed)
     assert holds({1: errors}) is is_good
 
 
