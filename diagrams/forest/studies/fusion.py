@@ -160,7 +160,7 @@ def judged(drive: Drive, scenario: ForestScenario) -> list[Error]:
     for name, condition in product(MAP_NAMES, CONDITIONS):
         counts = drive.times > (middle(drive) if condition == SILENT else STANDING)
         distances = {
-            s: _distances(drive, replace(scenario, perception=SENSORS[s], map=name), s, condition)[counts]
+            s: position_errors(drive, replace(scenario, perception=SENSORS[s], map=name), s, condition)[counts]
             for s in SENSORS
         }
         for sensors, of in distances.items():
@@ -173,7 +173,7 @@ def judged(drive: Drive, scenario: ForestScenario) -> list[Error]:
     return errors
 
 
-def _distances(drive: Drive, scenario: ForestScenario, sensors: str, condition: str) -> Array:
+def position_errors(drive: Drive, scenario: ForestScenario, sensors: str, condition: str) -> Array:
     """Return the errors of the position in m at the sample times of a drive, NaN without a pose, shape (n,)."""
     track = localize(seen_by(drive, sensors, condition), scenario.unit(scenario.global_map()))
     return np.where(track.is_localized, np.hypot(*(track.poses - drive.truth)[:, :2].T), nan)
@@ -254,7 +254,7 @@ def _ratio(errors: Sequence[Error]) -> float | None:
 def _errs_less(alone: Sequence[Error]) -> bool:
     """Return whether both sensors err less in a forest than each alone that has a pose there."""
     pairs = [error.common for error in alone if error.common is not None]
-    return bool(pairs) and all(both < one for one, both in pairs)
+    return bool(pairs) and all(both < error for error, both in pairs)
 
 
 def report(forests: Forests) -> str:

@@ -138,7 +138,7 @@ def test_errors_are_compared_where_both_units_have_a_pose(monkeypatch: pytest.Mo
     drive = Drive(times, np.zeros((4, 3)), np.zeros((4, 3)), ((),) * 4)
     alone, both = np.array([0.1, 0.1, nan, nan]), np.array([0.05, 0.05, 0.5, 1.0])
     distances = {"scanner": alone, "cameras": np.full(4, nan), "both": both}
-    monkeypatch.setattr(fusion, "_distances", lambda drive, scenario, sensors, condition: distances[sensors])
+    monkeypatch.setattr(fusion, "position_errors", lambda drive, scenario, sensors, condition: distances[sensors])
     scanner, cameras, together = (
         error for error in judged(drive, SCENARIO) if (error.condition, error.map) == ("as it is", "accurate")
     )
