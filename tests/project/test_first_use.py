@@ -126,11 +126,13 @@ def test_wrong_words_for_a_log_are_named_with_the_remedy(project: Path) -> None:
 @pytest.mark.parametrize("name", ["mujoco_arm", "hand", "torso", "fourbar", "cart_pole"])
 def test_other_robots_have_drives(name: str, tmp_path: Path) -> None:
     """Drives with a rotor, joints that follow, a differential, a loop, and a joint without a drive."""
-    project = write_project(tmp_path, f"my_{name}", read_robot(ROBOTS[name]))
+    # Another test of this process may have imported my_hand, which then could not be replaced.
+    package = f"driven_{name}"
+    project = write_project(tmp_path, package, read_robot(ROBOTS[name]))
     scenario = "".join(part.title() for part in project.name.split("_")) + "Scenario"
     script = (
-        f"import my_{name}, numpy as np\n"
-        f"testbed = my_{name}.{scenario}(drives=True).build()\n"
+        f"import {package}, numpy as np\n"
+        f"testbed = {package}.{scenario}(drives=True).build()\n"
         "context = testbed.default_context()\n"
         "testbed.simulator(context).AdvanceTo(0.2)\n"
         "q = np.ravel(testbed.read(context, 'sim.sense.position.joint_encoders'))\n"

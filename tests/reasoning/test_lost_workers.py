@@ -1,6 +1,7 @@
 """Decisions after a worker process was lost: its replacement prepares itself while the others decide."""
 
 import os
+import re
 import signal
 import time
 from dataclasses import dataclass
@@ -72,7 +73,8 @@ def test_after_a_killed_worker_the_other_one_decides(gated):
         os.kill(worker, signal.SIGKILL)
     decision = reasoner.decide(belief, budget=Budget(seconds=0.1))
     assert not decision
-    assert "not even of the plan in use" in decision.warnings[0]
+    # The deaths are noticed before the budget is spent, or not.
+    assert re.search("not even of the plan in use|its worker process died", decision.warnings[0])
 
 
 def test_after_a_hung_worker_the_other_one_decides(gated, monkeypatch):
