@@ -1,4 +1,4 @@
-"""What the checks of a calibration say of the recorded pendulums, arms and legs, whose columns are as they should be.
+"""The checks of a calibration, on recorded pendulums, arms and legs whose columns are as they should be.
 
 ``python -m vtbdrake_diagrams.recorded_arms.alarms FOLDER`` prints it. FOLDER holds the folders of the recordings, as
 for `vtbdrake_diagrams.recorded_arms.reality`, and dfki_double_pendulum. Nothing is fitted but inverse dynamics.

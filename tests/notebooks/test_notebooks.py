@@ -25,8 +25,8 @@ SHORTER: dict[str, Mapping[str, str]] = {
     "capture": {
         "[0.5, 7.0, 12.0]": "[0.5, 1.0, 1.5]",
         # Until the fingers hold the bar; tests/diagrams/satellite/test_capture.py waits longer.
-        "RolloutTask(scenario, 20.0": "RolloutTask(scenario, 7.0",
-        "last == Mode.HOLD": "last == Mode.TRACK",
+        "RolloutTask(scenario, 20.0": "RolloutTask(scenario, 13.0",
+        "last == Mode.HOLD": "last == Mode.RETREAT",
         "horizon=16.0": "horizon=8.5",
         "[0.5, 1.0, 2.0, 4.0, 16.0]": "[2.0]",
     },
@@ -47,7 +47,7 @@ SHORTER: dict[str, Mapping[str, str]] = {
         "width=640, height=400": "width=160, height=100",
         "length=25.0": "length=2.0",
         "cycles=200": "cycles=60",
-        "PARTED, END = 18.0, 25.0": "PARTED, END = 3.0, 4.0",
+        "PARTED, END = 18.0, 25.0": "PARTED, END = 3.0, 5.0",
     },
     "payload": {
         "values=[0, 20, 30, 40, 60]": "values=[0, 60]",

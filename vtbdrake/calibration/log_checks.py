@@ -170,7 +170,7 @@ def _longest_freeze(values: Array, *, other_joints: Array) -> int:
 
     Args:
         values: The positions of a joint, (n,).
-        other_joints: Those of the others, (n, nq - 1).
+        other_joints: The positions of all other joints, (n, nq - 1).
     """
     steps = abs(np.diff(values))
     if not other_joints.shape[1] or not steps.any():

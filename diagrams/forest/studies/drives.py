@@ -336,8 +336,8 @@ def score(tracks: Sequence[Track], *, deviation: float) -> Score:
     return Score(
         forests=len(tracks),
         path=float(sum(track.drive.travelled[-1] for track in tracks)),
-        position=_rms(distances),
-        heading=_rms(errors[:, 2]),
+        position=rms(distances),
+        heading=rms(errors[:, 2]),
         wrong=int((distances > 0.5 + 4.0 * deviation).sum()),
         nees=float(np.mean(np.concatenate(nees))) if len(errors) else np.nan,
         independent_nees=float(np.mean(independent)) if len(independent) else np.nan,
@@ -465,7 +465,8 @@ def against_best(
     )
 
 
-def _rms(values: ArrayLike) -> float:
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of some values; NaN of none."""
     squares = np.square(np.asarray(values, dtype=float))
     return float(np.sqrt(squares.mean())) if squares.size else np.nan
 
@@ -647,7 +648,7 @@ def main(forests: int, seed: int, bias: float, full: bool, source: str, workers:
     if len(tilts):
         late = np.concatenate([track.drive.times for track in driven.values()]) > LATE
         for when, rows in (("", slice(None)), (f", later than {LATE:g} s after the start", late)):
-            roll, pitch = (_rms(angles) for angles in tilts[rows].T)
+            roll, pitch = (rms(angles) for angles in tilts[rows].T)
             print(f"error of the vertical: {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
     best = against_best(driven, "poor", scenario=drives.scenario)
     print(f"best unbiased estimate on a poor map, by all landmarks within {REACH:g} m so far: {best.least:.2f} m")

@@ -33,7 +33,7 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive, rms
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import read_results, write_results
 
@@ -167,9 +167,9 @@ def judged(drive: Drive, scenario: ForestScenario) -> list[Error]:
             is_claimed, is_common = np.isfinite(of), np.isfinite(of + distances["both"])
             wrong = int((of[is_claimed] > 0.5 + 4.0 * MAPS[name].position).sum())
             poses, common_poses = int(is_claimed.sum()), int(is_common.sum())
-            rms = _rms(of[is_claimed]) if poses else None
-            common = (_rms(of[is_common]), _rms(distances["both"][is_common])) if common_poses else None
-            errors.append(Error(condition, name, sensors, rms, common, common_poses, poses, len(of), wrong))
+            error = rms(of[is_claimed]) if poses else None
+            common = (rms(of[is_common]), rms(distances["both"][is_common])) if common_poses else None
+            errors.append(Error(condition, name, sensors, error, common, common_poses, poses, len(of), wrong))
     return errors
 
 
@@ -177,10 +177,6 @@ def position_errors(drive: Drive, scenario: ForestScenario, sensors: str, condit
     """Return the errors of the position in m at the sample times of a drive, NaN without a pose, shape (n,)."""
     track = localize(seen_by(drive, sensors, condition), scenario.unit(scenario.global_map()))
     return np.where(track.is_localized, np.hypot(*(track.poses - drive.truth)[:, :2].T), nan)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the base's attitude deviations at the end, at most and in the mean cost each other: the front of application R2.
+"""The front of application R2: attitude deviations of the base at the end, at most and in the mean.
 
 ``python -m vtbdrake_diagrams.satellite.studies.arm_front [--pairs N]`` plans N random motions from near the stowed pose
 to the workspace, with a limit on the deviation on the way or a weight on its mean, and simulates the plans in the full
