@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from drake import lcmt_schunk_wsg_command
+from pydrake.common.value import Value
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import SceneGraphConfig
 from pydrake.lcm import DrakeLcm, DrakeLcmParams
@@ -22,8 +23,9 @@ from pydrake.manipulation import (
 from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 from pydrake.systems.lcm import ApplyLcmBusConfig, LcmBuses, LcmInterfaceSystem
+from pydrake.systems.primitives import ConstantValueSource, PortSwitch
 from pydrake.systems.sensors import ApplyCameraConfig, CameraConfig
 
 
@@ -81,6 +83,7 @@ def build(
     bus: DrakeLcm | None = None,
     grip: lcmt_schunk_wsg_command | None = None,
     sources: Mapping[str, System] | None = None,
+    switched: bool = False,
     cameras: bool = False,
     rate: float = 0.0,
     offset: float = 0.0,
@@ -94,6 +97,8 @@ def build(
         bus: The bus of all drivers instead.
         grip: A command that waits on the gripper's bus.
         sources: What feeds the ports of the arm's driver, which has no bus.
+        switched: Whether a port switch leads from each source to the driver, beside as many more as a station of an arm
+            and a gripper has.
         cameras: Whether there are cameras, on the bus of the gripper.
         rate: The realtime rate.
         offset: How far all joints of the arm are from their initial positions, in rad.
@@ -133,7 +138,10 @@ def build(
             ApplyCameraConfig(config=camera, builder=builder, lcm_buses=buses)
     for name, source in (sources or {}).items():
         builder.AddSystem(source)
-        builder.Connect(source.get_output_port(), builder.GetSubsystemByName("iiwa").GetInputPort(name))
+        output = source.get_output_port()
+        if switched:
+            output = _behind_switches(builder, output)
+        builder.Connect(output, builder.GetSubsystemByName("iiwa").GetInputPort(name))
     simulator = Simulator(builder.Build())
     ApplySimulatorConfig(scenario.simulator_config, simulator)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -142,3 +150,17 @@ def build(
     if own is not None and grip is not None:
         own.Publish("SCHUNK_WSG_COMMAND", grip.encode())
     return Plain(simulator, plant, own)
+
+
+def _behind_switches(builder: DiagramBuilder, output: OutputPort) -> OutputPort:
+    """Add a port switch for each of ten ports, and return the output of the first.
+
+    Three commands have one to the world and one to the machine, four sensors have one to the DPS.
+    """
+    first, *_ = switches = [builder.AddSystem(PortSwitch(output.size())) for _ in range(2 * 3 + 4)]
+    ports = [switch.DeclareInputPort("sim") for switch in switches]
+    selector = builder.AddSystem(ConstantValueSource(Value(ports[0].get_index())))
+    for switch, port in zip(switches, ports, strict=True):
+        builder.Connect(selector.get_output_port(), switch.get_port_selector_input_port())
+        builder.Connect(output, port)
+    return first.get_output_port()
