@@ -268,7 +268,9 @@ def _our(name: str, record: _Record, case: Case, seed: int, budget: int) -> None
     """Run one of our solvers from one start to its end."""
     start = None
     if name.startswith("LN_"):
-        start = tuple(p.from_unit(x) for p, x in zip(case.space, np.random.default_rng(seed).random(9), strict=False))
+        start = tuple(
+            p.from_unit(x) for p, x in zip(case.space, np.random.default_rng(seed).random(len(case.space)), strict=True)
+        )
     violation = case.violation
     solver = make_solver(
         name,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.common.argument_checks import all_of, as_number
+from vtbdrake.common.extras import extra_module
 from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.environments.rewards import Reward, violates
 from vtbdrake.environments.spaces import Action
@@ -192,7 +193,9 @@ def episodes_of(
 
     Raises:
         ValueError: An argument is missing, of another type, or does not fit the others.
+        ModuleNotFoundError: gymnasium is not installed.
     """
+    extra_module("gymnasium", purpose="an environment for reinforcement learning", extra="gymnasium")
     if isinstance(problem, Problem):
         if horizon is not None or parameters:
             raise ValueError("horizon and parameters are part of the problem: leave them out, or give the scenario")

@@ -6,9 +6,8 @@ import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vtbdrake.common.extras import extra_module
 from vtbdrake.compiled import CompilerError
-from vtbdrake.environments.episodes import Episodes, episodes_of
+from vtbdrake.environments.episodes import episodes_of
 from vtbdrake.environments.rewards import Reward
 from vtbdrake.environments.spaces import Action
 from vtbdrake.optimization import Problem
@@ -62,7 +61,16 @@ def gymnasium_env(
             limits.
         ModuleNotFoundError: gymnasium is not installed.
     """
-    episodes = _episodes(problem, action, observation, reward, period, horizon, parameters, failure_reward)
+    episodes = episodes_of(
+        problem,
+        action=action,
+        observation=observation,
+        reward=reward,
+        period=period,
+        horizon=horizon,
+        parameters=parameters,
+        failure_reward=failure_reward,
+    )
     from vtbdrake.environments.env import TestbedEnv
 
     return TestbedEnv(episodes, problem.testbed if isinstance(problem, Problem) else None)
@@ -107,7 +115,16 @@ def gymnasium_vector_env(
     """
     if executor not in EXECUTORS:
         raise ValueError(f"executor is one of {', '.join(EXECUTORS)}, not {executor!r}")
-    episodes = _episodes(problem, action, observation, reward, period, horizon, parameters, failure_reward)
+    episodes = episodes_of(
+        problem,
+        action=action,
+        observation=observation,
+        reward=reward,
+        period=period,
+        horizon=horizon,
+        parameters=parameters,
+        failure_reward=failure_reward,
+    )
     from vtbdrake.environments.compiled_vector import CompiledVectorEnv
     from vtbdrake.environments.process_vector import ProcessVectorEnv
 
@@ -120,26 +137,3 @@ def gymnasium_vector_env(
             # What else is wrong with the arguments is raised below.
             _log.info("the environments are simulated in Drake: %s", error)
     return ProcessVectorEnv(episodes, num_envs, workers=workers)
-
-
-def _episodes(
-    problem: Problem | Scenario,
-    action: Action,
-    observation: Sequence[str],
-    reward: Quality | Reward | None,
-    period: float | None,
-    horizon: float | None,
-    parameters: Sequence[Dimension],
-    failure_reward: float | None,
-) -> Episodes:
-    extra_module("gymnasium", purpose="an environment for reinforcement learning", extra="gymnasium")
-    return episodes_of(
-        problem,
-        action=action,
-        observation=observation,
-        reward=reward,
-        period=period,
-        horizon=horizon,
-        parameters=parameters,
-        failure_reward=failure_reward,
-    )
