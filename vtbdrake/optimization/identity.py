@@ -224,7 +224,7 @@ def _without_code(measures: Any) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages on which the numbers depend."""
-    packages = ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "optuna", "casadi")
+    packages = ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "cobyqa", "optuna", "casadi")
     by_package = {package: installed for package in packages if (installed := _version(package)) is not None}
     return {"python": platform.python_version(), **by_package}
 

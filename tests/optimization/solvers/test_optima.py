@@ -270,6 +270,18 @@ def _beyond_the_disk(p):
     return (p[0] ** 2 + p[1] ** 2 - 1.0,)
 
 
+@pytest.mark.parametrize(("size", "first"), [(2, 5), (5, 8), (12, 14)])
+def test_cobyqa_has_a_model_after_few_points(size, first):
+    slope = np.arange(1.0, size + 1.0)
+    log = drive(make_solver("COBYQA", box(size, -1.0, 1.0), budget=first + 1), lambda p: slope @ p)
+    # The first step along the model of a plane: down its slope, or more by all that differs.
+    *design, step = (np.array(e.point) for e in log)
+    assert len(design) == first
+    assert slope @ step < min(slope @ point for point in design)
+    assert sum(np.count_nonzero(point) <= 2 for point in design) == first
+    assert np.count_nonzero(step) == size
+
+
 @pytest.mark.slow_cases
 @pytest.mark.parametrize("start", [(0.2, 0.2), (-0.5, 0.5), (0.0, -0.9)])
 def test_cobyqa_follows_a_curved_constraint(start):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import numpy as np
 
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
@@ -11,14 +9,19 @@ from vtbdrake.optimization.solvers.solver import Search, SolverError
 
 # The most calls of a search without a budget.
 LIMIT = 5_000
+# The least number of points that a model interpolates, unless 2 n + 1 are fewer.
+POINTS = 8
 
 
 class Cobyqa(BlockingSolver):
-    """Constrained optimization by quadratic approximations, without derivatives; of SciPy.
+    """Constrained optimization by quadratic approximations, without derivatives; of the package cobyqa.
 
     Sequential quadratic programming in a trust region: the objective and every constraint are interpolated by quadratic
     models. COBYLA has linear ones, with which it follows a curved constraint in small steps only. It asks for one point
     at a time, and ends, with success, when the trust region has shrunk to ``tolerance``.
+
+    A model interpolates n + 2 points, and at least 8 or 2 n + 1. The package's 2 n + 1 would spend most of a small
+    budget on the first model; n + 2 are the fewest with which a model has some curvature.
 
     Args:
         search: Continuous parameters, one objective.
@@ -42,31 +45,21 @@ class Cobyqa(BlockingSolver):
 
     def _solve(self) -> tuple[bool, str]:
         # Imported here because it is slow.
-        from scipy.optimize import NonlinearConstraint, minimize
+        from cobyqa import minimize
+        from scipy.optimize import Bounds, NonlinearConstraint
 
-        _run_side_by_side()
+        size, lower = self.search.size, np.zeros(self.search.size)
         constraint = NonlinearConstraint(self._callback(lambda u: self._at(u)[2]), -np.inf, 0.0)
         result = minimize(
             self._callback(lambda u: self._at(u)[1]),
             self.search.start_unit(),
-            method="COBYQA",
-            bounds=[(0.0, 1.0)] * self.search.size,
+            bounds=Bounds(lower, lower + 1.0),
             constraints=(constraint,) if self.search.constraints else (),
             options={
-                "initial_tr_radius": self._radius,
-                "final_tr_radius": self._tolerance,
+                "radius_init": self._radius,
+                "radius_final": self._tolerance,
                 "maxfev": self.search.budget or LIMIT,
+                "nb_points": max(size + 2, min(2 * size + 1, POINTS)),
             },
         )
         return bool(result.success), str(result.message)
-
-
-def _run_side_by_side() -> None:
-    """Replace the lock that SciPy 1.17 holds during a whole search: a second one, in another thread, would never begin.
-
-    The algorithm shares no state between calls, and newer releases have no lock.
-    """
-    from scipy.optimize import _cobyqa_py
-
-    if hasattr(_cobyqa_py, "COBYQA_LOCK"):
-        _cobyqa_py.COBYQA_LOCK = nullcontext()
