@@ -11,9 +11,9 @@ import numpy as np
 from benchmarks.measure import LOWER, Benchmark, interleaved, ratio
 from vtbdrake.optimization import Study
 from vtbdrake.optimization.records import Trial
+from vtbdrake_diagrams.satellite.arm_move import RESTING
+from vtbdrake_diagrams.satellite.arm_planning import Plan, plan_by_casadi, plan_by_drake
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
-from vtbdrake_diagrams.satellite.studies.arm_move import RESTING
-from vtbdrake_diagrams.satellite.studies.arm_planning import Plan, plan_by_casadi, plan_by_drake
 from vtbdrake_diagrams.satellite.studies.trajectory import search_problem
 
 # Target of the deviation at the end, in rad.

@@ -18,7 +18,7 @@ from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, gripper_errors
-from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Guidance, Mode, stopping_speed
+from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Arrival, Guidance, Mode, stopping_speed
 
 # The distance from the ends of the arm's joints, in rad.
 _MARGIN = 0.02
@@ -49,6 +49,8 @@ class ArmController(AddressedSystem):
         - relative
         - guidance
         - joint_position
+        - arrival (only with ``plans``)
+        - plan_position (only with ``plans``)
         output_ports:
         - joint_position
         - reaction
@@ -68,15 +70,22 @@ class ArmController(AddressedSystem):
     h_B then changes by ``largest_reaction`` (N m) at most. The output ``reaction`` is dh_B/dt (N m), the torque that
     keeps the base's attitude; 0 without wheels.
 
+    With ``plans``, the arm follows ``plan_position`` (7, rad) while ``arrival`` is `Arrival.PLANNED`, within its
+    drives' rates; the plan has limits of its own. What its momentum changes by is part of ``reaction``, too.
+
     Otherwise the rates decay (time constant ``brake_time``). After an abort, when the fingers are open, the gripper
     backs off along its z axis for ``back_off`` seconds, and the arm returns to where it was stowed. The fingers follow
     the guidance's opening with ``finger_rate``.
     """
 
-    def __init__(self, *, period: float, wheels: bool = False) -> None:
+    def __init__(self, *, period: float, wheels: bool = False, plans: bool = False) -> None:
         super().__init__()
-        self._period, self._wheels = period, wheels
+        self._period, self._wheels, self._plans = period, wheels, plans
         servicer = Servicer()
+        self._speeds = servicer.speeds
+        if plans:
+            self._arrival = self.DeclareVectorInputPort("arrival", 1)
+            self._plan_position = self.DeclareVectorInputPort("plan_position", ARM_JOINTS)
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
         self._guidance = self.DeclareVectorInputPort("guidance", GUIDANCE)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
@@ -121,20 +130,25 @@ class ArmController(AddressedSystem):
         relative, measured = self._relative.Eval(context), self._joints.Eval(context)
         command, motion = self._command.mutable_array(state), self._motion.mutable_array(state)
         following = self._rates.value((settings, guidance, relative, measured, command, motion))
+        most = self._settings.view(context).largest_reaction
+        if self._plans and self._arrival.Eval(context).item() == Arrival.PLANNED:
+            ahead = (self._plan_position.Eval(context) - command[:ARM_JOINTS]) / self._period
+            following[:ARM_JOINTS] = np.clip(ahead, -self._speeds, self._speeds)
+            most = UNLIMITED
         if self._wheels:
-            rates = self._gentle(context, state, motion[:ARM_JOINTS], following[:ARM_JOINTS])
+            rates = self._gentle(context, state, motion[:ARM_JOINTS], following[:ARM_JOINTS], most)
             following[:ARM_JOINTS] = rates
         motion[:] = following
         command[:] = self._moved.value((settings, guidance, measured, command, motion))
         self._measured.mutable_array(state)[:] = measured
 
-    def _gentle(self, context: Context, state: DiscreteValues, before: Array, rates: Array) -> Array:
-        """Return the rates on the way from the last period's to ``rates`` whose momentum changes slowly.
+    def _gentle(self, context: Context, state: DiscreteValues, before: Array, rates: Array, reaction: float) -> Array:
+        """Return the rates on the way from the last period's to ``rates`` whose momentum changes by a reaction at most.
 
         The momentum and its rate are written to ``state``.
         """
         q, mode = self._joints.Eval(context)[:ARM_JOINTS], Guidance.of(self._guidance.Eval(context)).mode
-        most = self._period * self._settings.view(context).largest_reaction
+        most = self._period * reaction
         momentum, holding = self._momentum.mutable(state), mode in (Mode.RETREAT, Mode.HOLD)
         kernel = arm_reaction(holding=holding)
         unchanged = kernel.value((q, before))[:3].copy()

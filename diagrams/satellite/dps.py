@@ -14,16 +14,19 @@ from pydrake.systems.primitives import (
     Saturation,
 )
 
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.components.perception.target_tracker import TargetTracker
+from vtbdrake.components.perception.target_tracker import STATE_SIZE, MotionModel, TargetTracker
 from vtbdrake.components.sensors.raw_values import make_calibration
-from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
+from vtbdrake.components.spline_command import SplineCommand
+from vtbdrake.testbed import SlowPart
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.control import ACCELERATION, UNLIMITED, ArmController, AttitudeController
-from vtbdrake_diagrams.satellite.estimation import BaseEstimator
+from vtbdrake_diagrams.satellite.estimation import BASE, BaseEstimator
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_marker_part, add_scan_part
 from vtbdrake_diagrams.satellite.pose_sensor import PoseReader
 from vtbdrake_diagrams.satellite.relative_motion import RelativeMotion
-from vtbdrake_diagrams.satellite.supervisor import Supervisor
+from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, PLAN, PLAN_KNOTS, PLAN_TIME_OF_NONE, Supervisor
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
@@ -61,7 +64,26 @@ class TargetSensors:
     pose_latency: float
 
 
-def make_dps(sensing: TargetSensors, *, period: float = PERIOD, wheels: bool = False) -> Diagram:
+@dataclass(frozen=True)
+class ApproachConfig:
+    """How the arm's approach is planned.
+
+    Attributes:
+        duration: The duration of the move, in s.
+        latency: The time that planning may take, in s.
+    """
+
+    duration: float
+    latency: float
+
+
+def make_dps(
+    sensing: TargetSensors,
+    *,
+    period: float = PERIOD,
+    wheels: bool = False,
+    approach: ApproachConfig | None = None,
+) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` leads the capture, ``act`` limits.
 
     Input ports: ``joint_position`` (9: the arm's joints in rad, the fingers in m), ``imu`` (6), ``target_pose`` (7, see
@@ -69,7 +91,8 @@ def make_dps(sensing: TargetSensors, *, period: float = PERIOD, wheels: bool = F
     -1: abort). Output ports: ``joint_position`` (9) and, with ``wheels``, ``wheel_torque`` (3, N m, on the base about
     its axes).
 
-    Every part is sampled with ``period`` (s) and shows its own state: no input feeds through.
+    Every part is sampled with ``period`` (s) and shows its own state: no input feeds through. With ``approach``,
+    ``impl`` has two more: the slow part ``planner`` plans the arm's approach, and ``approach`` tells where the plan is.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem(
@@ -77,7 +100,7 @@ def make_dps(sensing: TargetSensors, *, period: float = PERIOD, wheels: bool = F
         make_calibration({"joint_position": len(JOINT_NAMES), "imu": 6}, largest={"joint_position": 0.1, "imu": 1.0}),
     )
     env = builder.AddNamedSystem("env", _make_env(sensing, period=period))
-    impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
+    impl = builder.AddNamedSystem("impl", _make_impl(sensing.config, period=period, wheels=wheels, approach=approach))
     act = builder.AddNamedSystem("act", _make_act(wheels=wheels))
     for signal in ("joint_position", "imu"):
         builder.ExportInput(sense.GetInputPort(signal), signal)
@@ -146,14 +169,17 @@ def _make_env(sensing: TargetSensors, *, period: float) -> Diagram:
     return builder.Build()
 
 
-def _make_impl(*, period: float, wheels: bool) -> Diagram:
+def _make_impl(config: PerceptionConfig, *, period: float, wheels: bool, approach: ApproachConfig | None) -> Diagram:
     """Return the supervisor and the controllers that it leads."""
     builder = DiagramBuilder()
     relative = builder.AddNamedSystem("relative", RelativeMotion(period=period))
+    acceleration, duration = ACCELERATION if wheels else UNLIMITED, approach.duration if approach else None
     supervisor = builder.AddNamedSystem(
-        "supervisor", Supervisor(period=period, acceleration=ACCELERATION if wheels else UNLIMITED)
+        "supervisor", Supervisor(period=period, acceleration=acceleration, plan_duration=duration)
     )
-    controller = builder.AddNamedSystem("controller", ArmController(period=period, wheels=wheels))
+    controller = builder.AddNamedSystem(
+        "controller", ArmController(period=period, wheels=wheels, plans=approach is not None)
+    )
     for port in ("base", "target", "status"):
         builder.ExportInput(relative.GetInputPort(port), port)
     builder.ExportInput(supervisor.GetInputPort("capture"), "capture")
@@ -164,7 +190,11 @@ def _make_impl(*, period: float, wheels: bool) -> Diagram:
             builder.Connect(relative.get_output_port(), system.GetInputPort("relative"))
         else:
             builder.ExportInput(port, "joints")
-    builder.Connect(supervisor.get_output_port(), controller.GetInputPort("guidance"))
+    builder.Connect(supervisor.GetOutputPort("guidance"), controller.GetInputPort("guidance"))
+    if approach is not None:
+        _add_planner(
+            builder, supervisor, controller, approach=approach, motion=config.motion, period=period, wheels=wheels
+        )
     builder.ExportOutput(controller.GetOutputPort("joint_position"), "joint_position")
     if wheels:
         attitude = builder.AddNamedSystem("attitude", AttitudeController(period=period))
@@ -174,6 +204,53 @@ def _make_impl(*, period: float, wheels: bool) -> Diagram:
             builder.Connect(source.GetOutputPort(port), attitude.GetInputPort(port))
         builder.ExportOutput(attitude.get_output_port(), "wheel_torque")
     return builder.Build()
+
+
+def _add_planner(
+    builder: DiagramBuilder,
+    supervisor: Supervisor,
+    controller: ArmController,
+    *,
+    approach: ApproachConfig,
+    motion: MotionModel,
+    period: float,
+    wheels: bool,
+) -> None:
+    """Add the slow part that plans the approach, and what follows the plan."""
+    # Imported here: without it, the DPS needs no optimization.
+    from vtbdrake_diagrams.satellite.approach import ApproachPlanner
+
+    s = Servicer()
+    function = ApproachPlanner(
+        duration=approach.duration, period=period, latency=approach.latency, wheels=wheels, motion=motion
+    )
+    none = np.concatenate([[PLAN_TIME_OF_NONE], np.tile(s.stowed, PLAN_KNOTS)])
+    part = SlowPart(
+        function,
+        inputs={"base": BASE, "target": STATE_SIZE, "guidance": GUIDANCE, "joint_position": len(JOINT_NAMES)},
+        outputs={"plan": PLAN, "fixture": 3, "disturbance": 1},
+        period=period,
+        latency=approach.latency,
+        offset=period,
+        initial={"plan": none},
+        on_request=True,
+    )
+    planner = builder.AddNamedSystem("planner", part)
+    spline = Spline("bspline", PLAN_KNOTS, approach.duration)
+    follower = builder.AddNamedSystem(
+        "approach", SplineCommand(spline, period=period, size=ARM_JOINTS, initial=s.stowed, unit="rad")
+    )
+    builder.ConnectInput("base", planner.GetInputPort("base"))
+    builder.ConnectInput("target", planner.GetInputPort("target"))
+    builder.ConnectInput("target", supervisor.GetInputPort("target"))
+    builder.Connect(supervisor.GetOutputPort("guidance"), planner.GetInputPort("guidance"))
+    builder.Connect(supervisor.GetOutputPort("request"), planner.GetInputPort("request"))
+    builder.Connect(controller.GetOutputPort("joint_position"), planner.GetInputPort("joint_position"))
+    builder.Connect(planner.GetOutputPort("plan"), follower.GetInputPort("plan"))
+    for port in ("plan", "fixture", "missed"):
+        builder.Connect(planner.GetOutputPort(port), supervisor.GetInputPort(port))
+    builder.Connect(supervisor.GetOutputPort("arrival"), controller.GetInputPort("arrival"))
+    builder.Connect(follower.GetOutputPort("value"), controller.GetInputPort("plan_position"))
 
 
 def _make_act(*, wheels: bool) -> Diagram:

@@ -28,7 +28,7 @@ from vtbdrake.lcm.sensor_messages import image_map, scan_map
 from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, TargetSensors, make_dps
+from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, ApproachConfig, TargetSensors, make_dps
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, target_board
 from vtbdrake_diagrams.satellite.plant import plant_config
 from vtbdrake_diagrams.satellite.supervisor import GO, STAY, STOP
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
 
 PERCEPTIONS = ("camera+scanner", "camera", "scanner", "pose_sensor")
+APPROACHES = ("resolved_rate", "planned")
 ONLOOKERS = ("", *PERCEPTIONS[:3])
 
 
@@ -96,6 +97,13 @@ class SatelliteScenario(Scenario):
     # How images and scans are evaluated.
     evaluation: PerceptionConfig = field(default_factory=PerceptionConfig)
     wheels: bool = setting(False, "Whether the servicer holds its attitude by reaction wheels.")
+    approach: str = setting(
+        "resolved_rate", "How the arm comes before the bar: by resolved rate, or along a plan.", choices=APPROACHES
+    )
+    approach_time: float = setting(15.0, "The duration of a planned approach.", unit="s", ge=5.0, le=40.0)
+    planning_time: float = setting(
+        4.0, "How long the arm waits for its plan, which then has to be there.", unit="s", ge=PERIOD, le=30.0
+    )
     # Errors of the sensors, latency in periods; the IMU's noise is in rad/s (gyros) and in m/s^2 (accelerometers).
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
     joint_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
@@ -195,7 +203,9 @@ class SatelliteScenario(Scenario):
             image_latency=self.camera_errors.latency / self.camera_fps,
             pose_latency=self.pose_errors.latency * POSE_PERIOD,
         )
-        return make_dps(sensing, wheels=self.wheels)
+        planned = self.approach == "planned"
+        approach = ApproachConfig(duration=self.approach_time, latency=self.planning_time) if planned else None
+        return make_dps(sensing, wheels=self.wheels, approach=approach)
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on its satellite: joints hold after a fault, and CAPTURE carries the command.

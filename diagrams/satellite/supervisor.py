@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-from math import cos, exp
+from math import cos, exp, hypot
 from typing import Any, NamedTuple
 
 import casadi
@@ -14,9 +14,11 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.casadi_system.rotations import exponential
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
+from vtbdrake_diagrams.satellite.estimation import rotated
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative, gripper_errors
 
 
@@ -65,6 +67,26 @@ class Reason(IntEnum):
         return member
 
 
+class Arrival(IntEnum):
+    """How the arm comes before the bar in the mode approach; the variable ``arrival`` holds the numbers."""
+
+    RATES = 0
+    """By resolved rate, from the start."""
+    PLANNING = 1
+    """A plan has been asked for; the arm waits for it."""
+    PLANNED = 2
+    """Along the plan."""
+    ARRIVED = 3
+    """The plan has ended; resolved rate goes on."""
+    REFUSED = 4
+    """There is no plan; by resolved rate."""
+    DROPPED = 5
+    """The target is not where it was predicted, or is not seen: the plan was left, resolved rate goes on."""
+
+
+PLAN_TIME_OF_NONE = 1e9
+"""The beginning of a plan that nobody has made, in s."""
+
 GO = 1.0
 """Value of the command ``capture``: go ahead."""
 STAY = 0.0
@@ -72,11 +94,19 @@ STAY = 0.0
 STOP = -1.0
 """Value of the command ``capture``: abort."""
 
+# With a plan: how long the target is watched before one is asked for, and see `Supervisor`.
+_PLAN_SETTINGS = {"watch_time": (2.0, "s", 60.0), "plan_tolerance": (0.15, "m", 10.0)}
+# How long the arm stops where a plan is dropped, in s: until the base, too, no longer turns against the target.
+_STOPPING = 1.0
 # Time constant of the low-pass filter of the arm's positions, in s.
 _SMOOTHING = 0.5
 
 GUIDANCE = 6
 """Size of a `Guidance` as a vector."""
+PLAN_KNOTS = 9
+"""The number of knots of a planned approach."""
+PLAN = 1 + PLAN_KNOTS * ARM_JOINTS
+"""Size of the plan of an approach: [t_begin (s), knots (rad)], see `SplineCommand`."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +186,15 @@ def _situation() -> Kernel:
     return Kernel("situation", [relative, guidance], values, compile=None)
 
 
+@lru_cache
+def _fixture_later() -> Kernel:
+    """Return p_IHo after a time at constant velocities as a kernel of (the state of a `TargetTracker`, the time)."""
+    target, later = casadi.SX.sym("target", 13), casadi.SX.sym("later", 1)
+    q, p, w, v = casadi.vertsplit(target, [0, 4, 7, 10, 13])
+    fixture = exponential(later * w) @ rotated(q, casadi.DM(Target().X_TH.translation()))
+    return Kernel("fixture_later", [target, later], casadi.densify(p + later * v + fixture), compile=None)
+
+
 class Supervisor(AddressedSystem):
     """A state machine that leads a capture from sensor data alone.
 
@@ -166,8 +205,14 @@ class Supervisor(AddressedSystem):
         - capture
         - relative
         - joint_position
+        - target (only with a plan)
+        - plan (only with a plan)
+        - fixture (only with a plan)
+        - missed (only with a plan)
         output_ports:
         - guidance
+        - arrival (only with a plan)
+        - request (only with a plan)
 
     ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` comes from `RelativeMotion`. ``acceleration``
     limits how fast ``closing_speed`` is reached and left.
@@ -194,10 +239,18 @@ class Supervisor(AddressedSystem):
     half is for what the target does while the fingers close.
 
     The variables ``mode`` and ``reason`` are numbers of `Mode` and `Reason`.
+
+    With ``plan_duration`` (s), the first approach is planned. When the target has been watched for ``watch_time``, the
+    supervisor asks for a plan by ``request``, and the arm waits for it. The answer is ``plan``, whose first number is
+    the time at which it begins, and ``fixture``, the place in I where the fixture will then be at its end; or
+    ``missed`` counts one more. The arm is on the plan while ``arrival``, an `Arrival`, says so. The plan is dropped
+    when the present estimate, a ``target`` that turns at a constant rate, has the fixture farther than
+    ``plan_tolerance`` from there at its end, and when the estimate is old; then the arm stops before it goes on.
     """
 
-    def __init__(self, *, period: float, acceleration: float) -> None:
+    def __init__(self, *, period: float, acceleration: float, plan_duration: float | None = None) -> None:
         super().__init__()
+        self._plan_duration = plan_duration
         self._period = period
         self._opening, self._bar = Servicer().opening, 2.0 * Target().bar_radius
         self._situation = _situation()
@@ -214,6 +267,16 @@ class Supervisor(AddressedSystem):
             flip=Quantity(0.0, bounds=flag),
         )
         self.DeclareStateOutputPort("guidance", self._instructions.index)
+        if plan_duration is not None:
+            sizes = {"target": 13, "plan": PLAN, "fixture": 3, "missed": 1}
+            self._plan_inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
+            self._arrival = self.declare_discrete_state(
+                arrival=Quantity(Arrival.RATES, bounds=(0, Arrival.DROPPED)),
+            )
+            self.DeclareStateOutputPort("arrival", self._arrival.index)
+            self._request = self.declare_discrete_state(request=Quantity(0.0, bounds=flag))
+            self.DeclareStateOutputPort("request", self._request.index)
+            self._stop = self.declare_discrete_state(stopping=Quantity(0.0, "s"))
         self._memory = self.declare_discrete_state(
             reason=Quantity(Reason.START, bounds=(0, Reason.SLIPPED)),
             time_in_mode=Quantity(0.0, "s"),
@@ -242,6 +305,7 @@ class Supervisor(AddressedSystem):
             "attempts": (3.0, "1", 100.0),
             "still_rate": (2e-3, "rad/s", 1.0),
             "still_time": (1.0, "s", 60.0),
+            **({} if plan_duration is None else _PLAN_SETTINGS),
         }
         self._settings = self.declare_parameters(
             **{name: Quantity(value, unit, (0.0, most)) for name, (value, unit, most) in settings.items()}
@@ -264,7 +328,10 @@ class Supervisor(AddressedSystem):
         memory.time_in_mode += T
         memory.capture_time = memory.capture_time + T if mode != Mode.WAIT else 0.0
         guidance.rate = 0.0
-        trouble = self._trouble(mode, go, situation, memory.capture_time, p)
+        planned = self._plan_duration is not None and self._follow_plan(
+            context, state, mode, memory.time_in_mode, fresh, p
+        )
+        trouble = self._trouble(mode, go, situation, memory.capture_time, p, planned=planned)
         if trouble is not None:
             guidance.mode, memory.reason = Mode.ABORT, trouble
         elif mode == Mode.WAIT:
@@ -272,7 +339,7 @@ class Supervisor(AddressedSystem):
                 guidance.mode, memory.reason, guidance.distance = Mode.APPROACH, Reason.TRACKED, p.standoff
                 relative = Relative(self._relative.Eval(context))
                 guidance.flip = (relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0
-        elif mode in (Mode.APPROACH, Mode.TRACK) and fresh:
+        elif mode in (Mode.APPROACH, Mode.TRACK) and fresh and not planned:
             self._steer(guidance, memory, situation, rate, p)
         elif mode == Mode.GRIP:
             self._grip(guidance, memory, still, holds, p)
@@ -284,10 +351,41 @@ class Supervisor(AddressedSystem):
             guidance.opening = self._opening
         if guidance.mode != mode:
             memory.time_in_mode = memory.steady_for = 0.0
-        guidance.follows = guidance.mode in (Mode.APPROACH, Mode.TRACK, Mode.GRIP) and fresh
+        guidance.follows = guidance.mode in (Mode.APPROACH, Mode.TRACK, Mode.GRIP) and fresh and not planned
         memory.last_fingers = left, right
         decay = exp(-T / _SMOOTHING)
         memory.smooth_position = [now - decay * late for now, late in zip(arm, behind, strict=True)]
+
+    def _follow_plan(
+        self, context: Context, state: DiscreteValues, mode: float, time_in_mode: float, fresh: bool, p: NamedView
+    ) -> bool:
+        """Ask for a plan, or see how it goes on; return whether the arm waits for it, is on it or stops."""
+        arrival, request, stop = (each.mutable(state) for each in (self._arrival, self._request, self._stop))
+        if mode != Mode.APPROACH:
+            if arrival.arrival in (Arrival.PLANNING, Arrival.PLANNED):
+                arrival.arrival = Arrival.DROPPED
+            return mode == Mode.WAIT  # The approach may begin in this period.
+        target, plan, fixture, missed = (port.Eval(context) for port in self._plan_inputs.values())
+        now, begin = context.get_time(), plan.item(0)
+        if arrival.arrival == Arrival.RATES:
+            arrival.arrival = Arrival.PLANNING
+        elif arrival.arrival == Arrival.PLANNING and request.request == 0.0:
+            # Until its velocities are known well.
+            request.request = float(time_in_mode > p.watch_time)
+        elif arrival.arrival == Arrival.PLANNING and missed.item(0) > 0.5:
+            arrival.arrival = Arrival.REFUSED
+        elif arrival.arrival == Arrival.PLANNING and begin < PLAN_TIME_OF_NONE:
+            arrival.arrival = Arrival.PLANNED
+        elif arrival.arrival == Arrival.PLANNED:
+            # What follows the plan shows its own state: it is a period behind.
+            left = begin + self._plan_duration + 2.0 * self._period - now
+            drift = _fixture_later().value((target, np.array([max(left, 0.0)]))) - fixture
+            if left <= 0.0:
+                arrival.arrival = Arrival.ARRIVED
+            elif not fresh or hypot(*drift.tolist()) > p.plan_tolerance:
+                arrival.arrival, stop.stopping = Arrival.DROPPED, _STOPPING
+        stop.stopping = max(stop.stopping - self._period, 0.0)
+        return arrival.arrival in (Arrival.PLANNING, Arrival.PLANNED) or stop.stopping > 0.0
 
     def _lasts(self, memory: NamedView, true: bool) -> float:
         """Return for how long something has been true, in s."""
@@ -327,17 +425,23 @@ class Supervisor(AddressedSystem):
             memory.attempts_made += 1.0
             guidance.distance, guidance.opening = p.standoff, self._opening
 
-    def _trouble(self, mode: float, go: float, situation: _Situation, since: float, p: NamedView) -> float | None:
-        """Return the reason for an abort, or None."""
+    def _trouble(
+        self, mode: float, go: float, situation: _Situation, since: float, p: NamedView, *, planned: bool
+    ) -> float | None:
+        """Return the reason for an abort, or None.
+
+        On a plan, the base turns to and fro as planned, and the fixture with it: that its place and speed against the
+        base are within the limits counts afterwards.
+        """
         if mode not in (Mode.APPROACH, Mode.TRACK, Mode.GRIP):
             return Reason.COMMANDED if go < -0.5 and mode in (Mode.RETREAT, Mode.HOLD) else None
         if go < -0.5:
             return Reason.COMMANDED
         if situation.age > p.lost_after or not situation.tracked > 0.5:
             return Reason.LOST
-        if self._unreachable(situation, p):
+        if not planned and self._unreachable(situation, p):
             return Reason.OUT_OF_REACH
-        if situation.speed > p.largest_speed:
+        if not planned and situation.speed > p.largest_speed:
             return Reason.TOO_FAST
         return Reason.TIMEOUT if since > p.time_limit else None
 

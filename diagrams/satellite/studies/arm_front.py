@@ -20,8 +20,8 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.pareto import undominated
 from vtbdrake.rollout.executor import cores
+from vtbdrake_diagrams.satellite.arm_planning import plan_by_casadi
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
-from vtbdrake_diagrams.satellite.studies.arm_planning import plan_by_casadi
 from vtbdrake_diagrams.satellite.studies.trajectory import Course, random_scenarios, simulate
 
 # Starts of the solver for a plan.

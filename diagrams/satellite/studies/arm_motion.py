@@ -20,9 +20,9 @@ from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.satellite.arm_move import ORDER, REACHING, RESTING, Move, move_space
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.plant import plant_config
-from vtbdrake_diagrams.satellite.studies.arm_move import ORDER, REACHING, RESTING, Move, move_space
 
 if TYPE_CHECKING:
     from vtbdrake.reasoning import OnboardReasoner
@@ -142,7 +142,7 @@ class ArmMotionScenario(Scenario):
     def _make_planner(self) -> OnboardReasoner:
         # Imported here: without it, the DPS needs no optimization.
         from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig
-        from vtbdrake_diagrams.satellite.studies.arm_planning import MomentumDescent
+        from vtbdrake_diagrams.satellite.arm_planning import MomentumDescent
 
         return OnboardReasoner(
             1 + self.knots * ARM_JOINTS,

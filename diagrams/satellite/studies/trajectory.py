@@ -24,7 +24,10 @@ from vtbdrake.optimization import Problem
 from vtbdrake.rollout.executor import cores
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.satellite.arm_move import REACHING
+from vtbdrake_diagrams.satellite.arm_planning import plan_calmly
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Servicer
+from vtbdrake_diagrams.satellite.clearance import DrakeClearance
 from vtbdrake_diagrams.satellite.studies.arm_motion import (
     BASE,
     DEVIATION,
@@ -35,9 +38,6 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import (
     free_knots,
     limits,
 )
-from vtbdrake_diagrams.satellite.studies.arm_move import REACHING
-from vtbdrake_diagrams.satellite.studies.arm_planning import plan_calmly
-from vtbdrake_diagrams.satellite.studies.clearance import DrakeClearance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

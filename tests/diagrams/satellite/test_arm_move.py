@@ -9,10 +9,8 @@ import pytest
 
 from vtbdrake.optimization.solvers import make_solver
 from vtbdrake.optimization.solvers.solver import SolverError
-from vtbdrake_diagrams.satellite.bodies import Servicer
-from vtbdrake_diagrams.satellite.studies.arm_motion import PLAN, ArmMotionScenario, free_knots
-from vtbdrake_diagrams.satellite.studies.arm_move import REACHING, Move, MoveSpace, move_space
-from vtbdrake_diagrams.satellite.studies.arm_planning import (
+from vtbdrake_diagrams.satellite.arm_move import REACHING, Move, MoveSpace, move_space
+from vtbdrake_diagrams.satellite.arm_planning import (
     CALM,
     GOOD_ENOUGH,
     MomentumDescent,
@@ -20,7 +18,11 @@ from vtbdrake_diagrams.satellite.studies.arm_planning import (
     plan_by_casadi,
     plan_by_drake,
     plan_calmly,
+    plan_near,
 )
+from vtbdrake_diagrams.satellite.bodies import Servicer
+from vtbdrake_diagrams.satellite.kinematics import reaction
+from vtbdrake_diagrams.satellite.studies.arm_motion import PLAN, ArmMotionScenario, free_knots
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +59,15 @@ def test_cost_and_constraints_are_those_of_the_motion(move, weight):
     np.testing.assert_allclose(g[move.space.steps :][: torques.size], torques, atol=1e-12)
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.7])
-def test_slopes_are_those_of_finite_differences(move, weight):
-    move = replace(move, weight=weight)
+@pytest.fixture(scope="module")
+def held(move) -> Move:
+    """Return the move while wheels hold the base."""
+    return replace(move, space=move_space(20.0, 9, wheels=True))
+
+
+@pytest.mark.parametrize(("kind", "weight"), [("move", 0.0), ("move", 0.7), ("held", 0.0)])
+def test_slopes_are_those_of_finite_differences(request, kind, weight):
+    move = replace(request.getfixturevalue(kind), weight=weight)
     value, slopes = move.space.functions
     z, h = bent(move, 0.2)[2:-2].ravel(), 1e-6
     way = np.random.default_rng(3).standard_normal(z.size)
@@ -68,6 +76,33 @@ def test_slopes_are_those_of_finite_differences(move, weight):
     assert gradient.ravel() @ way == pytest.approx(float(above[0] - below[0]) / (2.0 * h), rel=1e-5)
     difference = (above[1] - below[1]).full().ravel() / (2.0 * h)
     np.testing.assert_allclose(jacobian @ way, difference, atol=1e-6)
+
+
+def test_wheels_give_what_the_momentum_of_the_arm_changes_by(held):
+    knots, spline, h = bent(held, 0.2), held.space.spline, 1e-4
+    value, _ = held.space.functions
+    g = value(knots[2:-2].ravel(), held.numbers)[1].full().ravel()
+
+    def momentum(t: float) -> np.ndarray:
+        q, rates = ((spline.matrix([t], k) @ knots)[0] for k in range(2))
+        return np.array(reaction(holding=False).value((q, rates))[:3])
+
+    times = np.linspace(h, 20.0 - h, 13)[1:-1]
+    torques = np.array([(momentum(t + h) - momentum(t - h)) / (2.0 * h) for t in times])
+    shares = np.sum((torques / Servicer().wheel_torque) ** 2, axis=1)
+    # The instants are every half of a piece; the kernel has closed fingers, here they are open.
+    np.testing.assert_allclose(g[1:12], shares, rtol=0.05, atol=0.02)
+    assert held.space.disturbance(g) == pytest.approx(np.sqrt(g[:13].max()))
+
+
+def test_plan_near_another_one_needs_few_iterations(held):
+    usual = plan_by_casadi(held, attempts=1)
+    other = replace(held, goal=held.goal + 0.05)
+    plan = plan_near(other, usual, iterations=10)
+    assert not plan.move.excess(plan.knots)
+    straight = other.space.functions[0](other.straight[2:-2].ravel(), other.numbers)[1].full().ravel()
+    assert plan.deviation < 0.5 * other.space.disturbance(straight)
+    np.testing.assert_array_equal(plan.knots[-1], other.goal)
 
 
 def test_bounds_agree_with_the_limits(move):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from vtbdrake.testbed import ScenarioError
+from vtbdrake_diagrams.satellite.arm_move import REACHING, Move, move_space
+from vtbdrake_diagrams.satellite.arm_planning import plan_by_casadi, plan_by_drake
 from vtbdrake_diagrams.satellite.bodies import Servicer
+from vtbdrake_diagrams.satellite.clearance import CLEARANCE, ArmClearance, DrakeClearance
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
-from vtbdrake_diagrams.satellite.studies.arm_move import REACHING, Move, move_space
-from vtbdrake_diagrams.satellite.studies.arm_planning import plan_by_casadi, plan_by_drake
-from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance, DrakeClearance
 
 # Starts and goals in rad between which a plan runs into the base, and links 5 and 7 into each other, if the planner
 # watches no more than points of the arm; the straight paths are clear.
@@ -102,3 +103,16 @@ def test_ends_in_collision_are_refused_by_name(fields, message, drake):
     assert drake.nearest(q)[0] < 0.0
     with pytest.raises(ScenarioError, match=message):
         ArmMotionScenario(**fields).build()
+
+
+def test_distance_from_boxes_of_another_body_is_to_their_surface(arm):
+    q, X_TB = np.array(REACHING), RigidTransform(RollPitchYaw(0.1, -0.2, 0.3), [-2.4, 0.1, 0.0])
+    boxes = [((0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), ((0.03, 1.0, 0.6), (0.0, 1.0, 0.0))]
+    random, distances = np.random.default_rng(0), []
+    for edges, center in boxes:
+        points = random.uniform(-0.5, 0.5, (200_000, 3))
+        points[np.arange(len(points)), random.integers(3, size=len(points))] = random.choice([-0.5, 0.5], len(points))
+        surface = points * edges + center
+        for p, radius in zip((X_TB @ arm.centers(q).full()).T, arm.radii, strict=True):
+            distances.append(np.linalg.norm(surface - p, axis=1).min() - radius)
+    assert arm.from_boxes(q, X_TB, boxes) == pytest.approx(min(distances), abs=5e-3)

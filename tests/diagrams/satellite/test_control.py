@@ -17,7 +17,7 @@ from vtbdrake.state.systems import collect
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.control import ArmController
 from vtbdrake_diagrams.satellite.plant import add_servicer, arm_positions
-from vtbdrake_diagrams.satellite.supervisor import Mode
+from vtbdrake_diagrams.satellite.supervisor import Arrival, Mode
 
 T = 0.02
 Q = np.array([0.1, 0.9, -0.2, 1.8, 0.1, 0.8, 0.3])
@@ -41,9 +41,11 @@ def arm() -> tuple[RigidTransform, Array]:
 class Bench:
     """A controller whose arm stays at `Q`, with open fingers."""
 
-    def __init__(self, mode: float, *, X_BH: RigidTransform, follows: bool, distance: float = 0.0) -> None:
+    def __init__(
+        self, mode: float, *, X_BH: RigidTransform, follows: bool, distance: float = 0.0, plan: Array | None = None
+    ) -> None:
         builder = DiagramBuilder()
-        system = builder.AddNamedSystem("controller", ArmController(period=T))
+        system = builder.AddNamedSystem("controller", ArmController(period=T, plans=plan is not None))
         diagram = builder.Build()
         self.simulator = Simulator(diagram)
         self.root = self.simulator.get_mutable_context()
@@ -56,6 +58,8 @@ class Bench:
             "guidance": [mode, follows, distance, 0.0, opening, 0.0],
             "joint_position": [*Q, opening, opening],
         }
+        if plan is not None:
+            values |= {"arrival": [Arrival.PLANNED], "plan_position": plan}
         for name, value in values.items():
             system.GetInputPort(name).FixValue(context, value)
         self.set("joint_position", values["joint_position"])
@@ -83,6 +87,14 @@ def test_gripper_moves_to_its_place_before_the_fixture() -> None:
     rates = bench.get("joint_rate_command")
     np.testing.assert_allclose(J @ rates, np.concatenate((e_R, e_p)), atol=1e-9)  # with gains of 1/s
     np.testing.assert_allclose(bench.get("joint_position")[:ARM_JOINTS], Q + T * rates, atol=1e-12)
+
+
+def test_arm_is_led_along_a_plan_within_the_rates_of_its_drives() -> None:
+    plan = Q + np.array([0.005, -0.005, 0.0, 0.1, 0.0, 0.0, 0.0])
+    bench = Bench(Mode.APPROACH, X_BH=arm()[0], follows=False, plan=plan)
+    bench.run(1)
+    command = bench.get("joint_position")[:ARM_JOINTS]
+    np.testing.assert_allclose(command - Q, [0.005, -0.005, 0.0, 0.01, 0.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_command_stays_near_the_arm() -> None:

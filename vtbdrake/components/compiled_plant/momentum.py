@@ -122,6 +122,16 @@ class MomentumModel(PlantDynamics):
         lever = M[:3, 3:] / M[5, 5]  # [p_BoBcm]x
         return momentum[:3] - lever @ momentum[3:], M[:3, :3] - lever @ M[3:, :3]
 
+    def center(self, q: Expression) -> Expression:
+        """Return p_BoCm_B of the whole tree's centre of mass, shape (3, 1), in m: free of forces, it stays where it is.
+
+        Args:
+            q: Positions of the joints, shape (m, 1).
+        """
+        M = self._locked(self._positions(q))
+        lever = M[:3, 3:] / M[5, 5]
+        return casadi.vertcat(lever[2, 1], lever[0, 2], lever[1, 0])
+
     def torque(self, q: Expression, qdot: Expression, qddot: Expression) -> Expression:
         """Return the torques of the drives that move the joints so, shape (m, 1), in N m (or N).
 

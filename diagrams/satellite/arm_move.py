@@ -33,8 +33,8 @@ from vtbdrake.common.spline import Spline
 from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, MomentumModel, base_poses
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, Servicer
+from vtbdrake_diagrams.satellite.clearance import CLEARANCE, ArmClearance
 from vtbdrake_diagrams.satellite.plant import add_servicer
-from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance
 
 ORDER = "bspline"
 RESTING = 2
@@ -59,32 +59,39 @@ FEASIBILITY = 1e-5
 class MoveSpace:
     """The arm's moves of one duration: the plans, and their effect on the base; compiled once.
 
+    What a plan does to the base, its disturbance, is how far the base turns if it floats freely. With ``wheels`` it is
+    the torque dh_B/dt that they have to give so that the base does not turn at all, see `MomentumModel.reaction`.
+
     Attributes:
         spline: The curve of each joint.
         servicer: The satellite.
+        wheels: Whether it holds its attitude by wheels.
         model: Its momentum model, fingers open.
         reaction: The function that computes the motion of the base and the torques.
         arm: The distances of the arm from base, panels and itself.
     """
 
-    def __init__(self, *, duration: float = 20.0, knots: int = 9, servicer: Servicer | None = None) -> None:
+    def __init__(
+        self, *, duration: float = 20.0, knots: int = 9, servicer: Servicer | None = None, wheels: bool = False
+    ) -> None:
         """Read the servicer's plant.
 
         Args:
             duration: The duration of a move in seconds.
             knots: The number of knots of a plan; all but the two at each end are free.
             servicer: The satellite; by default the testbed's.
+            wheels: Whether it holds its attitude by wheels.
 
         Raises:
             ValueError: No knot is free.
         """
         if knots <= 2 * RESTING:
             raise ValueError(f"a plan from rest to rest has more than {2 * RESTING} knots, not {knots}")
-        self.servicer = servicer or Servicer()
+        self.servicer, self.wheels = servicer or Servicer(), wheels
         self.spline = Spline(ORDER, knots, duration)
         self.free = knots - 2 * RESTING
         plant = MultibodyPlant(0.0)
-        instance = add_servicer(plant, self.servicer, servos=False)
+        instance = add_servicer(plant, self.servicer, wheels=wheels, servos=False)
         plant.Finalize()
         joints = [plant.GetJointByName(name, instance) for name in ARM_JOINT_NAMES]
         self.model = MomentumModel(plant, plant.CreateDefaultContext(), joints=joints)
@@ -96,6 +103,9 @@ class MoveSpace:
         torque = self.model.torque(q, rate, change)
         self._velocity = casadi.Function("velocity", [q, rate], [self.model.base_velocity(q, rate)], {"cse": True})
         self._torque = casadi.Function("torque", [q, rate, change], [torque], {"cse": True})
+        h = self.model.reaction(q, rate)[0]
+        reaction = (casadi.jtimes(h, q, rate) + casadi.jtimes(h, rate, change)) / self.servicer.wheel_torque
+        self._load = casadi.Function("load", [q, rate, change], [casadi.sumsqr(reaction)], {"cse": True})
         self.arm = ArmClearance(self.servicer)
         # At the ends the arm is where it is.
         self._watched = np.linspace(0.0, duration, _INSTANTS_PER_STEP * self.steps + 1)[1:-1]
@@ -104,42 +114,64 @@ class MoveSpace:
     def functions(self) -> tuple[casadi.Function, casadi.Function]:
         """Return (z, p) -> cost, g and (z, p) -> cost, its gradient, g, its Jacobian.
 
-        z are the free knots, shape (7 k,), knot by knot; p is `Move.numbers`, shape (15,). The cost is 4 sin^2(q / 2),
-        which is q^2 for small q, plus the weight times its mean over the move, in rad^2; g are the constraints of
-        `bounds`, which begin with 4 sin^2 of half the deviation at the end of each step.
+        z are the free knots, shape (7 k,), knot by knot; p is `Move.numbers`, shape (15,). g are the constraints of
+        `bounds`, which begin with the squares of the disturbance: 4 sin^2 of half the deviation at the end of each
+        step; with wheels, their torque squared at some instants, as a share of the square of what they give. The cost
+        is the deviation's square at the end, which is q^2 for small q, plus the weight times its mean over the move, in
+        rad^2; with wheels, the mean of the torque's fourth power, which keeps its largest value low.
         """
         z, p = casadi.MX.sym("z", ARM_JOINTS * self.free), casadi.MX.sym("p", 2 * ARM_JOINTS + 1)
         start, goal, weight = p[:ARM_JOINTS], p[ARM_JOINTS:-1], p[-1]
         knots = casadi.horzcat(start, start, casadi.reshape(z, ARM_JOINTS, self.free), goal, goal)
-        rotation = self.reaction.function(knots)[0]
-        deviation = 4.0 * casadi.sum1(rotation[1:, 1:] ** 2).T
-        at, rate, change = (knots @ casadi.DM(self.spline.matrix(self._instants, k).T) for k in range(3))
-        # The acceleration is linear between the breaks of the curve: there, and halfway, the torque is known well.
-        some = slice(None, None, _STEPS_PER_PIECE // 2)
-        limits, count = self.servicer.torques, len(self._instants[some])
-        torques = self._torque.map(count)(at[:, some], rate[:, some], change[:, some])
-        torques /= casadi.DM(limits)
+        squares, by_knots = self._loads(knots) if self.wheels else self._deviations(knots)
+        some, limits = self._some_instants, self.servicer.torques
+        at, rate, change = (knots @ casadi.DM(self.spline.matrix(some, k).T) for k in range(3))
+        torques = self._torque.map(len(some))(at, rate, change) / casadi.DM(limits)
         rates = knots @ casadi.DM(self.spline.bezier(1).T) / casadi.DM(self.servicer.speeds)
         clear = self.arm.soft.map(len(self._watched))(knots @ casadi.DM(self.spline.matrix(self._watched).T))
-        # The deviations at the ends of the steps, in the cost.
-        shares = casadi.vertcat(casadi.repmat(weight / self.steps, self.steps - 1, 1), 1.0 + weight / self.steps)
-        cost = casadi.dot(shares, deviation)
-        g = casadi.vertcat(deviation, casadi.vec(torques), casadi.vec(rates), casadi.vec(clear))
+        if self.wheels:
+            cost, shares = casadi.sumsqr(squares) / squares.numel(), 2.0 * squares / squares.numel()
+        else:  # The deviations at the ends of the steps.
+            shares = casadi.vertcat(casadi.repmat(weight / self.steps, self.steps - 1, 1), 1.0 + weight / self.steps)
+            cost = casadi.dot(shares, squares)
+        g = casadi.vertcat(squares, casadi.vec(torques), casadi.vec(rates), casadi.vec(clear))
         value = casadi.Function("arm_move", [z, p], [cost, g], ["z", "p"], ["cost", "g"])
-        # The deviation follows from the velocities at the ends and in the middles of the steps.
+        slope = casadi.vertcat(
+            by_knots,
+            self._slope(self._torque, knots, some, 3) / casadi.DM(np.tile(limits, len(some))),
+            casadi.jacobian(casadi.vec(rates), z),
+            self._slope(self.arm.soft, knots, self._watched, 1),
+        )
+        return value, casadi.Function("arm_move_slopes", [z, p], [cost, by_knots.T @ shares, g, slope])
+
+    @property
+    def _some_instants(self) -> Array:
+        """The accelerations are linear between the breaks: there, and halfway, torques are known well."""
+        return self._instants[:: _STEPS_PER_PIECE // 2]
+
+    def _deviations(self, knots: Expression) -> tuple[Expression, Expression]:
+        """Return the squares of the deviation at the ends of the steps, and their Jacobian by the free knots."""
+        rotation = self.reaction.function(knots)[0]
+        # They follow from the velocities at the ends and in the middles of the steps.
         halves = np.linspace(0.0, self.spline.duration, 2 * self.steps + 1)
         at, rate = (knots @ casadi.DM(self.spline.matrix(halves, k).T) for k in range(2))
         V = casadi.MX.sym("V", 6, len(halves))
         squares = 4.0 * casadi.sum1(base_poses(self.steps, self.spline.duration)(V)[0][1:, 1:] ** 2).T
         by_velocity = casadi.Function("by_velocity", [V], [casadi.jacobian(squares, V)])
         turned = by_velocity(self._velocity.map(len(halves))(at, rate)) @ self._slope(self._velocity, knots, halves, 2)
-        slope = casadi.vertcat(
-            turned,
-            self._slope(self._torque, knots, self._instants[some], 3) / casadi.DM(np.tile(limits, count)),
-            casadi.jacobian(casadi.vec(rates), z),
-            self._slope(self.arm.soft, knots, self._watched, 1),
-        )
-        return value, casadi.Function("arm_move_slopes", [z, p], [cost, turned.T @ shares, g, slope])
+        return 4.0 * casadi.sum1(rotation[1:, 1:] ** 2).T, turned
+
+    def _loads(self, knots: Expression) -> tuple[Expression, Expression]:
+        """Return the squares of the wheels' torque at some instants, and their Jacobian by the free knots."""
+        some = self._some_instants
+        at, rate, change = (knots @ casadi.DM(self.spline.matrix(some, k).T) for k in range(3))
+        return self._load.map(len(some))(at, rate, change).T, self._slope(self._load, knots, some, 3)
+
+    def disturbance(self, g: Array) -> float:
+        """Return the deviation q in rad by the constraints g; with wheels, their largest torque as a share of it."""
+        if self.wheels:
+            return float(np.sqrt(max(np.max(g[: len(self._some_instants)]), 0.0)))
+        return float(2.0 * np.arcsin(min(np.sqrt(max(g[self.steps - 1], 0.0)) / 2.0, 1.0)))
 
     def _slope(self, function: casadi.Function, knots: Expression, times: Array, count: int) -> Expression:
         """Return the Jacobian of a function of a plan by its free knots, shape (m p, 7 k).
@@ -171,13 +203,14 @@ class MoveSpace:
         """Return the lower and upper bounds of g.
 
         Args:
-            largest: Deviation of the base in rad.
+            largest: Deviation of the base in rad, infinite with wheels.
             clear: The least clearance of each group of `ArmClearance` in m.
         """
-        torques = len(self._instants[:: _STEPS_PER_PIECE // 2])
-        counts = self.steps, ARM_JOINTS * torques, ARM_JOINTS * len(self.spline.bezier(1))
+        some = len(self._some_instants)
+        counts = some if self.wheels else self.steps, ARM_JOINTS * some, ARM_JOINTS * len(self.spline.bezier(1))
         least = np.repeat([-inf, -1.0, -_RATE_SHARE], counts)
-        most = np.repeat([4.0 * np.sin(largest / 2.0) ** 2, 1.0, _RATE_SHARE], counts)
+        square = 4.0 * np.sin(largest / 2.0) ** 2 if largest < inf else inf
+        most = np.repeat([square, 1.0, _RATE_SHARE], counts)
         clear = np.tile(clear, len(self._watched))
         lower, upper = np.concatenate([least, clear]), np.concatenate([most, np.full(clear.size, inf)])
         return lower + 2.0 * FEASIBILITY, upper - 2.0 * FEASIBILITY * np.minimum(upper, 1.0)
@@ -259,8 +292,8 @@ class Move:
 
     @property
     def largest(self) -> float:
-        """Return the largest deviation that a plan may have, in rad."""
-        return self.turn * float(self.straight_motion.angle.max())
+        """Return the largest deviation that a plan may have, in rad; with wheels, there is no limit."""
+        return inf if self.space.wheels else self.turn * float(self.straight_motion.angle.max())
 
     def knots(self, z: ArrayLike) -> Array:
         """Return all knots, shape (n, 7), of the free ones, shape (7 k,)."""
@@ -322,6 +355,6 @@ class Move:
 
 
 @cache
-def move_space(duration: float, knots: int) -> MoveSpace:
+def move_space(duration: float, knots: int, *, wheels: bool = False) -> MoveSpace:
     """Return the moves of one duration in seconds, made once per process."""
-    return MoveSpace(duration=duration, knots=knots)
+    return MoveSpace(duration=duration, knots=knots, wheels=wheels)

@@ -1,6 +1,6 @@
 """Solvers of application R2: plans of the arm by gradients on the momentum model, with CasADi and with Drake.
 
-They solve the same problem, see `vtbdrake_diagrams.satellite.studies.arm_move`, with derivatives from CasADi, and from
+They solve the same problem, see `vtbdrake_diagrams.satellite.arm_move`, with derivatives from CasADi, and from
 the same starts: near the straight path, but not on it, since there the cost may be stationary across it (a motion in a
 plane).
 """
@@ -21,7 +21,7 @@ from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, Solve
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
-from vtbdrake_diagrams.satellite.studies.arm_move import FEASIBILITY, RESTING, Move, move_space
+from vtbdrake_diagrams.satellite.arm_move import FEASIBILITY, RESTING, Move, move_space
 
 GOOD_ENOUGH = 2e-3
 """The deviation q at which no further start is tried, in rad."""
@@ -43,6 +43,8 @@ _SCALE = 1e2
 _TOLERANCE = 1e-4
 # Largest number of their iterations.
 _ITERATIONS = 60
+# The share of what the wheels give at which CasADi's solver stops: the rest is for control.
+_HELD = 0.8
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class Plan:
     Attributes:
         move: The move, with the limits that were kept.
         knots: The knots in rad, shape (n, 7).
-        deviation: The deviation q in rad by the momentum model; infinite if no plan within the limits was found.
+        deviation: The deviation q in rad by the momentum model; with wheels, their largest torque as a share of what
+            they give. Infinite if no plan within the limits was found.
         history: The best q so far in rad over the wall time in s: (time, q), each better than the one before.
         message: How the solver ended, in its own words.
     """
@@ -71,20 +74,25 @@ class Plan:
 class _Best:
     """The best point within the limits among those that a solver has looked at."""
 
-    def __init__(self, move: Move) -> None:
+    def __init__(self, move: Move, target: float = _TARGET) -> None:
         self._begin, self._move = time.perf_counter(), move
         self._lower, self._upper = move.bounds
+        self._target = target
         self.z: Array | None = None
         self.cost = self.deviation = inf
         self.history: list[tuple[float, float]] = []
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the solver may stop."""
+        return self.deviation <= _HELD if self._move.space.wheels else self.cost <= _cost(self._target)
 
     def look(self, z: Array, cost: float, g: Array) -> None:
         """Take note of a point with its cost and its constraints, see `MoveSpace.functions`."""
         beyond = max(np.max(self._lower - g), np.max(g - self._upper))
         if beyond <= FEASIBILITY and cost < self.cost and not self._move.excess(self._move.knots(z)):
-            end = g[self._move.space.steps - 1]
             self.z, self.cost = np.array(z), cost
-            self.deviation = float(2.0 * np.arcsin(min(np.sqrt(max(end, 0.0)) / 2.0, 1.0)))
+            self.deviation = self._move.space.disturbance(g)
             self.history.append((time.perf_counter() - self._begin, self.deviation))
 
 
@@ -113,6 +121,21 @@ def plan_calmly(move: Move, *, attempts: int = 4) -> Plan:
     return plan if isfinite(plan.deviation) else plan_by_casadi(move, attempts=attempts)
 
 
+def plan_near(move: Move, plan: Plan, *, iterations: int, target: float = _TARGET) -> Plan:
+    """Return a plan by IPOPT, from one start: a plan of a similar move, bent to the ends of this one.
+
+    Args:
+        move: The move.
+        plan: The plan of the similar move, in the same `MoveSpace`.
+        iterations: The most iterations.
+        target: The deviation q in rad at which the solver stops.
+    """
+    best = _Best(move, target)
+    start = (move.straight + plan.knots - plan.move.straight)[RESTING:-RESTING].ravel()
+    message = _by_casadi(move, np.clip(start, *move.search_range), best, iterations)
+    return _best_plan(move, best, message)
+
+
 def plan_by_drake(move: Move, solver: str = "SNOPT", *, attempts: int = 4) -> Plan:
     """Return a plan by a solver of Drake's MathematicalProgram.
 
@@ -136,6 +159,10 @@ def _plan(move: Move, method: _Method, attempts: int) -> Plan:
         message = method(move, start_of(move, attempt), best)
         if best.cost <= _cost(good_enough(move)):
             break
+    return _best_plan(move, best, message)
+
+
+def _best_plan(move: Move, best: _Best, message: str) -> Plan:
     z = move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
     return Plan(move, move.knots(z), best.deviation, tuple(best.history), message)
 
@@ -157,7 +184,7 @@ def start_of(move: Move, attempt: int) -> Array:
     return np.clip(straight + _SPREAD * noise, *move.search_range)
 
 
-def _by_casadi(move: Move, start: Array, best: _Best) -> str:
+def _by_casadi(move: Move, start: Array, best: _Best, iterations: int = _ITERATIONS) -> str:
     z, p = casadi.MX.sym("z", start.size), casadi.MX.sym("p", move.numbers.size)
     value, slopes = move.space.functions
     # Inlined, the cost is computed without the constraints.
@@ -168,7 +195,7 @@ def _by_casadi(move: Move, start: Array, best: _Best) -> str:
         "ipopt.hessian_approximation": "limited-memory",
         "ipopt.tol": _TOLERANCE,
         "ipopt.constr_viol_tol": FEASIBILITY,
-        "ipopt.max_iter": _ITERATIONS,
+        "ipopt.max_iter": iterations,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "print_time": False,
@@ -204,7 +231,7 @@ class _Watch(casadi.Callback):
     def eval(self, arg: Sequence[Any]) -> list[Any]:
         x, f, g = (arg[i].full().ravel() for i in range(3))
         self._best.look(x, float(f[0]) / _SCALE, g)
-        return [int(self._best.cost <= _cost(_TARGET))]
+        return [int(self._best.is_there)]
 
 
 _DRAKE: dict[str, tuple[type[SolverInterface], dict[str, float]]] = {

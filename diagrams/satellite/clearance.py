@@ -105,6 +105,8 @@ class ArmClearance:
         distances: The function (q) -> signed distances in m, shape (len(names), 1).
         soft: The function (q) -> a smooth lower bound of the distances of each group in `groups`, shape (groups, 1).
         groups: The names of the groups.
+        centers: The function (q) -> the centres of the spheres in B, shape (3, spheres), in m.
+        radii: Their radii in m, shape (spheres,).
         reaches: For each joint the farthest that a point of the arm is from its axis, shape (7,), in m. No distance
             changes faster than the sum of reach times rate.
     """
@@ -127,9 +129,11 @@ class ArmClearance:
         model = MomentumModel(plant, plant.CreateDefaultContext(), joints=joints)
         q = casadi.SX.sym("q", ARM_JOINTS)
         shoulder, elbow = (model.point(plant.GetFrameByName(name), q) for name in ("link_2", "link_4"))
+        points = [model.point(frame, q) for frame in centers]
+        self.centers = casadi.Function("centers", [q], [casadi.densify(casadi.horzcat(*points))], {"cse": True})
+        self.radii = np.array([sphere.radius for sphere in spheres])
         clearances: dict[str, list[tuple[str, Expression]]] = {group: [] for group in self.groups}
-        for sphere, frame in zip(spheres, centers, strict=True):
-            p = model.point(frame, q)
+        for sphere, p in zip(spheres, points, strict=True):
             outer = LINK_NAMES.index(sphere.link) if sphere.link in LINK_NAMES else ARM_JOINTS
             group = self.groups[0 if outer < 3 else 1 if outer < 5 else 2]
             for name, distance in _from_base(s, p).items():
@@ -156,6 +160,22 @@ class ArmClearance:
     def least(self, q: ArrayLike) -> Array:
         """Return the least distance in m at each of n poses, shape (n, 7)."""
         return np.asarray(self.distances(np.asarray(q, dtype=float).T).full().min(axis=0))
+
+    def from_boxes(self, q: ArrayLike, X_TB: RigidTransform, boxes: Sequence[tuple[ArrayLike, ArrayLike]]) -> float:
+        """Return the least signed distance in m of the spheres from boxes on another body T.
+
+        Args:
+            q: Positions of the joints in rad, shape (7,).
+            X_TB: The pose of the base, seen from T.
+            boxes: (edges, centre in T) of each box, in m.
+        """
+        p = np.asarray(X_TB @ self.centers(np.asarray(q, dtype=float)).full())
+        distances = []
+        for edges, center in boxes:
+            beyond = np.abs(p - np.reshape(center, (3, 1))) - np.reshape(edges, (3, 1)) / 2.0
+            outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=0)
+            distances.append(outside + np.minimum(beyond.max(axis=0), 0.0) - self.radii)
+        return float(np.min(distances))
 
 
 def _function(name: str, q: Expression, values: Sequence[Expression]) -> casadi.Function:
