@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pydrake.geometry import (
     Mesh,
     MeshcatCone,
     PerceptionProperties,
+    ReadObjToTriangleSurfaceMesh,
     Role,
     SceneGraph,
     Shape,
@@ -33,7 +35,8 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.common.arrays import Array
-from vtbdrake.components.ray_casting import TOLERANCE, Hits, RayCaster
+from vtbdrake.components.meshes import obj_mesh, unit_sphere
+from vtbdrake.components.ray_casting import TOLERANCE, Hits, RayCaster, shape_surface
 
 AT_REST = SpatialVelocity.Zero()
 X_BG = RigidTransform(RollPitchYaw(0.4, -0.3, 0.8), [0.1, -0.2, 0.05])
@@ -222,6 +225,28 @@ def test_two_casters_agree_to_the_last_bit() -> None:
     directions, poses = around_x(1000, half_angle=0.3), [RigidTransform([2.0, 0, 0]), RigidTransform([1.5, 0.1, 0])]
     hits = [still(RayCaster(plant, scene_graph), directions, RigidTransform(), *poses) for _ in range(2)]
     assert hits[0].distances.tobytes() == hits[1].distances.tobytes()
+
+
+@pytest.mark.parametrize(
+    "kind", ["normals", "no normals", "scaled", "mirrored", "quadrilaterals", "comments", "counted from the end"]
+)
+def test_mesh_in_memory_is_the_one_that_drake_reads_from_a_file(kind: str, tmp_path: Path) -> None:
+    vertices, triangles = unit_sphere(1)
+    faces = [(0, 1, 2, 3), (4, 5, 6)] if kind == "quadrilaterals" else triangles
+    mesh = obj_mesh(vertices, faces, normals=vertices if kind == "normals" else None)
+    text = mesh.mesh_file.contents().decode()
+    if kind == "comments":
+        text = f"# A sphere of radius 1\n{text}"
+    elif kind == "counted from the end":
+        text = "\n".join(text.splitlines()[:-1]) + "\nf -3 -2 -1\n"
+    scale = {"scaled": [1.0, 2.0, 3.0], "mirrored": [1.0, -2.0, 3.0]}.get(kind, [1.0, 1.0, 1.0])
+    file = tmp_path / "mesh.obj"
+    file.write_text(text)
+    expected = ReadObjToTriangleSurfaceMesh(file, scale)
+    in_memory = InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "sphere"))
+    points, corners = shape_surface(Mesh(in_memory, scale), "sphere")
+    np.testing.assert_allclose(points, expected.vertices(), rtol=1e-15, atol=0.0)
+    assert corners.tolist() == [[t.vertex(k) for k in range(3)] for t in expected.triangles()]
 
 
 def test_shapes_that_cannot_be_cast_are_named() -> None:

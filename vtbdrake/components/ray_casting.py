@@ -269,10 +269,33 @@ def _mesh(shape: Any, name: str) -> Surface:
     source = shape.source()
     if source.is_path():
         return _read(source.path(), shape.scale3())
+    contents = source.in_memory().mesh_file.contents()
+    is_mirrored = (shape.scale3() < 0.0).any()  # Then Drake turns the triangles around.
+    if not is_mirrored and (surface := _triangles_alone(contents.decode())):
+        return surface[0] * shape.scale3(), surface[1]
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.obj"
-        path.write_bytes(source.in_memory().mesh_file.contents())
+        path.write_bytes(contents)
         return _read(path, shape.scale3())
+
+
+def _triangles_alone(text: str) -> Surface | None:
+    """Return the surface in a text as `obj_mesh` writes it, or None if it is more than vertices, normals and triangles.
+
+    From Drake's reader, each corner of each triangle comes to Python by a call of its own: that takes longer.
+    """
+    words = text.split()
+    kinds = words[::4]  # Each line has four words: what it is, and three numbers.
+    v, vn, f = (kinds.count(kind) for kind in ("v", "vn", "f"))
+    if not v or not f or kinds != ["v"] * v + ["vn"] * vn + ["f"] * f or len(words) % 4:
+        return None
+    try:
+        vertices = np.column_stack([[float(word) for word in words[k : 4 * v : 4]] for k in (1, 2, 3)])
+        corners = [[int(word.partition("/")[0]) for word in words[4 * (v + vn) + k :: 4]] for k in (1, 2, 3)]
+    except ValueError:
+        return None
+    triangles = np.column_stack(corners).astype(np.int32) - np.int32(1)
+    return (vertices, triangles) if 0 <= triangles.min() <= triangles.max() < v else None
 
 
 def _read(path: Path, scale: Array) -> Surface:
