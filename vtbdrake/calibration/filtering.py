@@ -18,17 +18,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil, inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import casadi
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from vtbdrake.calibration.joint_model import CalibrationError, JointModel
+from vtbdrake.calibration.joint_model import CalibrationError, JointModel, at_samples
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
-from vtbdrake.components.casadi_system.compiler import compiled_if_possible
 from vtbdrake.recording.log import GAP, Log, Series
 
 # How far the period of a recording may differ from a multiple of the plant's step, as a share of that step.
@@ -348,15 +346,7 @@ class Segments:
         self.trajectory = np.stack([smoothed[i][span] for i, span in self._pieces], axis=1)
         self._q = np.stack([recordings[i].q[span] for i, span in self._pieces], axis=1)
         self._steps = np.diff(self.times, axis=0)
-        self._function = self._compile().map(self.steps * self.count)
-
-    def _compile(self) -> casadi.Function:
-        """Return the function (x, m, h, z) -> following x, and its Jacobians by x, m and z, side by side."""
-        x, m, h, z = self.model.step.sx_in()
-        following = self.model.step(x, m, h, z)
-        parts = [following, *(casadi.jacobian(following, by) for by in (x, m, z))]
-        table = casadi.densify(casadi.horzcat(*parts))
-        return compiled_if_possible(casadi.Function("calibration_step", [x, m, h, z], [table], {"cse": True}))
+        self._step = at_samples(model.step_with_jacobians, self.steps * self.count)
 
     def substeps(self, z: Array) -> int:
         """Return the number of steps within a period: a discrete plant's, or enough for friction near rest.
@@ -397,19 +387,11 @@ class Segments:
         n, nu = self.model.nq, self.model.nu
         count, substeps = self.steps * self.count, self.substeps(z)
         h = np.full_like(self._steps, self.model.step_size) if self.model.step_size > 0.0 else self._steps / substeps
-        table = np.empty((count, 1 + 2 * n + nu + len(z), 2 * n))
-        buffer: Any  # whose stubs ask for a size that it does not take
-        buffer, evaluate = self._function.buffer()
-        buffer.set_res(0, table.reshape(-1).data)
         x, derivatives = self.trajectory[:-1], None
         for _ in range(substeps):
-            # CasADi's columns are rows here.
-            arguments = [np.ascontiguousarray(each).reshape(-1) for each in (x, m, h, np.tile(z, (count, 1)))]
-            for i, argument in enumerate(arguments):
-                buffer.set_arg(i, argument.data)
-            evaluate()
-            parts = table.swapaxes(1, 2).reshape(self.steps, self.count, 2 * n, -1)
-            x, by_x, direct = parts[..., 0].copy(), parts[..., 1 : 1 + 2 * n], parts[..., 1 + 2 * n :]
+            arguments = (each.reshape(count, -1) for each in (x, m, h, np.tile(z, (count, 1))))
+            parts = self._step(*arguments).reshape(self.steps, self.count, 2 * n, -1)
+            x, by_x, direct = parts[..., 0], parts[..., 1 : 1 + 2 * n], parts[..., 1 + 2 * n :]
             if derivatives is None:
                 derivatives = parts[..., 1:].copy()
             else:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.calibration.filtering import JointRecording
-from vtbdrake.calibration.joint_model import JointModel
+from vtbdrake.calibration.joint_model import JointModel, at_samples
 from vtbdrake.common.arrays import Array
 
 # A direction in which the recordings leave more than this, in units of the parameters' scales, is not determined.
@@ -55,7 +55,8 @@ class InverseDynamics:
     def __init__(self, model: JointModel) -> None:
         self._model = model
         symbols = model.unexplained.sx_in()
-        self._slope = casadi.Function("slope", symbols, [casadi.jacobian(model.unexplained(*symbols), symbols[-1])])
+        slope = casadi.densify(casadi.jacobian(model.unexplained(*symbols), symbols[-1]))
+        self._slope = casadi.Function("slope", symbols, [slope])
 
     def fit(self, recordings: Sequence[JointRecording], *, start: Array, most: int | None = None) -> TorqueFit:
         """Return the fit, within the ranges of the parameters.
@@ -70,41 +71,48 @@ class InverseDynamics:
         stride = _STRIDE if most is None else max(_STRIDE, samples // most)
         rows = [slice(_ENDS, len(recording.times) - _ENDS, stride) for recording in recordings]
         smoothed = [[part[span] for part in r.smoothed()] for r, span in zip(recordings, rows, strict=True)]
-        Q, V, A = (np.concatenate(parts).T for parts in zip(*smoothed, strict=True))
-        n = Q.shape[1]
-        residual_of_all, slope_of_all = model.unexplained.map(n), self._slope.map(n)
+        Q, V, A = (np.concatenate(parts) for parts in zip(*smoothed, strict=True))
+        n = len(Q)
+        residual, slope = at_samples(model.unexplained, n), at_samples(self._slope, n)
         selection = model.selection
 
-        def unexplained(at: Array) -> tuple[Array, Array, Array]:
+        def motors(at: Array) -> tuple[Array, Array]:
             torques, by = zip(*(model.motor(r.times, r.u, at) for r in recordings), strict=True)
             m = np.concatenate([t[span] for t, span in zip(torques, rows, strict=True)])
-            dm = np.concatenate([d[span] for d, span in zip(by, rows, strict=True)])
-            z_all = np.tile(at[:, np.newaxis], (1, n))
-            e = np.asarray(residual_of_all(Q, V, A, m.T, z_all)).T
-            J = np.asarray(slope_of_all(Q, V, A, m.T, z_all)).reshape(model.nq, n, len(at)).swapaxes(0, 1)
+            return m, np.concatenate([d[span] for d, span in zip(by, rows, strict=True)])
+
+        def unexplained(at: Array) -> tuple[Array, Array, Array]:
+            m, dm = motors(at) if model.drive_parameters else driven
+            return residual(Q, V, A, m, np.tile(at, (n, 1)))[..., 0], m, dm
+
+        def slopes_of(at: Array, m: Array, dm: Array) -> Array:
+            J = slope(Q, V, A, m, np.tile(at, (n, 1)))
             for k, index in enumerate(model.drive_parameters):
                 J[:, :, index] -= dm[:, k] @ selection.T
-            return e, J, m @ selection.T
+            return J
 
         z = np.array(start, dtype=float)
-        e, J, acting = unexplained(z)
+        driven = motors(z)
+        e, m, dm = unexplained(z)
         deviation = np.maximum(e.std(axis=0), 1e-9)
         for _ in range(_ITERATIONS):
-            white, slopes = (e / deviation).ravel(), (J / deviation[:, np.newaxis]).reshape(-1, len(z)) * scales
+            white, J = (e / deviation).ravel(), slopes_of(z, m, dm)
+            slopes = (J / deviation[:, np.newaxis]).reshape(-1, len(z)) * scales
             step = bounded_step(model, z, slopes.T @ slopes, slopes.T @ white)
             for _ in range(12):
                 trial = np.clip(z - step, model.lower, model.upper)
-                e_trial, J_trial, acting_trial = unexplained(trial)
+                e_trial, m_trial, dm_trial = unexplained(trial)
                 if ((e_trial / deviation) ** 2).sum() <= (white**2).sum():
                     break
                 step = 0.5 * step
             else:
                 break
-            moved, z, e, J, acting = abs(trial - z) / scales, trial, e_trial, J_trial, acting_trial
+            moved, z, e, m, dm = abs(trial - z) / scales, trial, e_trial, m_trial, dm_trial
             deviation = np.maximum(e.std(axis=0), 1e-9)
             if moved.max() < _CONVERGED:
                 break
         # By joint, as a wrist's torques are small beside a shoulder's; a passive joint has the torques of its motion.
+        acting = m @ selection.T
         power = np.maximum((acting**2).mean(axis=0), ((e + acting) ** 2).mean(axis=0))
         shares = (e**2).mean(axis=0) / np.maximum(power, 1e-12)
         is_loaded = power >= _LOADED**2 * power.max()
@@ -131,11 +139,11 @@ class InverseDynamics:
             z: The parameters, (nz,).
         """
         rows, model = slice(_ENDS, -_ENDS, _STRIDE), self._model
-        q, v, a = (part[rows].T for part in recording.smoothed())
+        q, v, a = (part[rows] for part in recording.smoothed())
         m = model.motor(recording.times, recording.u, z)[0][rows]
-        lack = model.unexplained.map(len(m))(q, v, a, m.T, np.tile(z[:, np.newaxis], (1, len(m))))
+        lack = at_samples(model.unexplained, len(m))(q, v, a, m, np.tile(z, (len(m), 1)))[..., 0]
         torque = m @ model.selection.T
-        return recording.times[rows], torque, np.asarray(lack).T + torque
+        return recording.times[rows], torque, lack + torque
 
 
 def directions_of(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi
@@ -22,6 +23,7 @@ from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.actuators.joint_drives import FRICTION, end_velocity, friction_size, friction_torque
+from vtbdrake.components.casadi_system.compiler import compiled_if_possible
 from vtbdrake.components.casadi_system.kernel import Expression
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.optimization import Parameter
@@ -100,6 +102,31 @@ def body_numbers(testbed: VirtualTestbed, context: Context, body: str) -> Array:
     """
     mass, com, inertia = (testbed.read(context, f"{body}.{part}") for part in _PARTS)
     return log_cholesky(float(mass), com, inertia)
+
+
+def at_samples(function: casadi.Function, n: int) -> Callable[..., Array]:
+    """Return a function of arrays, one for each argument with n rows, that evaluates one of CasADi at all rows.
+
+    It has a dense result of shape (r, c), and returns (n, r, c). CasADi's own matrices, which copy number by number,
+    take as long as the evaluation.
+
+    Args:
+        function: The function, of vectors.
+        n: The number of rows.
+    """
+    buffer: Any  # whose stubs ask for a size that it does not take
+    buffer, evaluate = function.map(n).buffer()
+
+    def evaluated(*arguments: Array) -> Array:
+        rows = [np.ascontiguousarray(argument, dtype=float).reshape(-1) for argument in arguments]
+        result = np.empty((n, *reversed(function.size_out(0))))  # CasADi's columns are rows here.
+        buffer.set_res(0, result.reshape(-1).data)
+        for i, row in enumerate(rows):
+            buffer.set_arg(i, row.data)
+        evaluate()
+        return result.swapaxes(1, 2)
+
+    return evaluated
 
 
 class JointModel:
@@ -189,6 +216,15 @@ class JointModel:
         half = 0.5 * (self.upper - self.lower)
         return np.where(np.isfinite(half), half, 1.0)
 
+    @cached_property
+    def step_with_jacobians(self) -> casadi.Function:
+        """Return (x, m, h, z) -> following x, and its Jacobians by x, m and z, side by side, compiled if possible."""
+        x, m, h, z = self.step.sx_in()
+        following = self.step(x, m, h, z)
+        parts = [following, *(casadi.jacobian(following, by) for by in (x, m, z))]
+        table = casadi.densify(casadi.horzcat(*parts))
+        return compiled_if_possible(casadi.Function("calibration_step", [x, m, h, z], [table], {"cse": True}))
+
     @property
     def varies_delay(self) -> bool:
         """Return whether the delay of the drives is one of the parameters."""
@@ -274,7 +310,7 @@ class JointModel:
         self.sharpness = casadi.Function("sharpness", [q, z], [casadi.densify(sharpness)])
         lost = selection @ friction(v) + dynamics.substituted([dynamics.damping_torque(v)], inputs)[0]
         self.friction = casadi.Function("friction", [v, m, z], [casadi.densify(lost)])
-        self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
+        self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [casadi.densify(needed)], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
         driven = casadi.Function("driven", [x, m, z], [tau])
         following = step[0] if step else _runge_kutta(lambda state: f(state, driven(state, m, z), z), x, h)
