@@ -55,6 +55,12 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import files without a slow test for the slow tests alone: each worker would."""
+    is_module = collection_path.suffix == ".py" and config.option.markexpr == "slow"
+    return True if is_module and "slow" not in collection_path.read_text("utf-8") else None
+
+
 def resident_memory() -> int:
     """Return the memory of this process, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
