@@ -17,12 +17,12 @@ def plain(value: Any, *, nonfinite: Callable[[float], str] | None = None) -> Any
     """
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if isinstance(value, float):  # First, as most are.
+        return value if isfinite(value) else nonfinite and nonfinite(value)
     if isinstance(value, Mapping):
         return {str(key): plain(entry, nonfinite=nonfinite) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [plain(entry, nonfinite=nonfinite) for entry in value]
     if is_dataclass(value) and not isinstance(value, type):
         return {item.name: plain(getattr(value, item.name), nonfinite=nonfinite) for item in fields(value)}
-    if isinstance(value, float):
-        return value if isfinite(value) else nonfinite and nonfinite(value)
     return value if value is None or isinstance(value, bool | int) else str(value)
