@@ -187,6 +187,18 @@ def test_factors_of_torques_are_those_by_which_they_were_divided() -> None:
     assert np.std(needed - torque) < 0.1 * np.std(torque)
 
 
+def test_fit_of_the_torques_finds_the_delay_of_the_drives() -> None:
+    log, delay = pendulum_log(), Parameter(f"{DRIVES}.delay", 0.0, 8.0)
+    model = JointModel(PendulumScenario().build(), [*PARAMETERS, delay])
+    u, delays = log.act["torque"], []
+    for periods in (1.0, 3.0):
+        late = Log("late.csv", log.sense, {"torque": Series(u.times - periods * PERIOD, u.values)})
+        recording = JointRecording.of(late, model, position="position", torque="torque")
+        fit = InverseDynamics(model).fit([recording], start=model.start)
+        delays.append(fit.z[model.names.index(delay.address)])
+    assert delays[1] - delays[0] == pytest.approx(2.0, abs=0.2)
+
+
 def test_positions_and_torques_that_are_exchanged_are_refused() -> None:
     with pytest.raises(CalibrationError, match="with positions and torques exchanged"):
         calibrated(with_columns(pendulum_log(), lambda q, u: (u, q)))
