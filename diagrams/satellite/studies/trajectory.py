@@ -38,6 +38,7 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import (
     free_knots,
     limits,
 )
+from vtbdrake_diagrams.satellite.studies.planned_capture import PlannedCaptures, kept_captures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -395,7 +396,10 @@ def survey(scenarios: Sequence[ArmMotionScenario], *, echo: Callable[[str], None
 
 
 def answer(full: bool) -> Answer:
-    """Answer R2: which trajectory of the arm disturbs the base least?"""
+    """Answer R2: which trajectory of the arm disturbs the base least?
+
+    What the plans are worth in captures is read from the kept ones.
+    """
     comparisons = survey(random_scenarios(_PAIRS_FULL if full else _PAIRS, seed=_SEED)).comparisons
     result = TrajectoryAnswer(
         Survey(comparisons[0::2]), Survey(comparisons[1::2]), compare(ArmMotionScenario(onboard=True))
@@ -420,7 +424,8 @@ def answer(full: bool) -> Answer:
         note=(
             f"In the full testbed: the DPS's decision on board turns the base by {turned[1]:.3f} deg instead of "
             f"{turned[0]:.2f} in the end, by {np.degrees(onboard.best.largest):.2f} instead of "
-            f"{np.degrees(onboard.straight.largest):.2f} at most. {verdicts(result.reaching, anywhere)}"
+            f"{np.degrees(onboard.straight.largest):.2f} at most. {verdicts(result.reaching, anywhere)} "
+            f"{PlannedCaptures(kept_captures()).sentence}."
         ),
     )
 
