@@ -264,9 +264,10 @@ class Tracker:
         fails, unjudged = health.judged(state, view, matches.pairs)
         if fails:
             return failed, Matches(matches.pairs)
-        if len(matches.pairs) < 2:
-            return state.with_arrays(unjudged=unjudged), Matches(matches.pairs)
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
+        # A first match alone has nothing that agrees with it; one of a landmark in the state does not need it.
+        if len(matches.pairs) < 2 and (is_first.all() or not len(matches.pairs)):
+            return state.with_arrays(unjudged=unjudged), Matches(matches.pairs)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
         fused, remaining = self._fused(extended, view, np.vstack([matches.pairs[~is_first], first.pairs]))
