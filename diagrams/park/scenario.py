@@ -41,6 +41,11 @@ _GATHERED = 100.0
 _LEAST_DEVIATION = 0.03
 # Standard deviation of the displacement of a scan in m: its time is known to a period of the DPS, 7 ms at 3 m/s.
 _SCAN_DEVIATION = 0.02
+# The share of the variance of detections that lasts: the correlation of their errors from scan to scan, along the ray,
+# in the first half of the drive in Victoria Park.
+_LASTING_SHARE = 0.5
+# The distance in m over which that correlation falls to a third.
+_LASTING_LENGTH = 8.0
 # The share of the variance of the map that neighbours share: the variance of the map's place, not of the trees on it.
 _SHARED = 0.9
 
@@ -117,6 +122,8 @@ class ParkScenario(Scenario):
             rate_walk=self.curvature_walk,
             least_deviation=_LEAST_DEVIATION,
             scan_deviation=_SCAN_DEVIATION,
+            lasting_share=_LASTING_SHARE,
+            lasting_length=_LASTING_LENGTH,
             correlation=self.correlation,
             correlated_share=_SHARED,
         )

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
 from vtbdrake.components.localization import health
+from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.track_state import TrackState
@@ -350,6 +351,103 @@ def test_a_displaced_or_turned_map_is_not_distorted():
         assert tracked(moved)[1][-1].distortion == pytest.approx(same[-1].distortion, rel=1e-3)
 
 
+def turned_by_the_odometry(drift):
+    """Return a tracker, and its state after a bend on which the odometry drifts by an angle in rad.
+
+    The map shows two landmarks beside the carrier, at first in view, and two 100 m behind, which have been seen, too.
+    """
+    places = np.array([[8.0, 4.0], [8.0, -4.0], [-100.0, 4.0], [-100.0, -4.0]])
+    tracker = Tracker(spread_out(places, 0.03), bias_deviation=1e-6, horizon=200.0)
+    surely = np.diag([0.01, 0.01, 1e-3]) ** 2
+    state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], spread_out(places, 0.03))
+    assert len(state.indices) == 4
+    return tracker, tracker.predict(state, [0.0, 0.0, drift], np.diag([1e-4, 1e-4, drift]) ** 2, extent=0.0), places
+
+
+def test_correction_of_the_heading_leaves_the_map_in_place():
+    """Of 0.1 rad: an arc about the carrier would displace what lies 100 m behind by 0.5 m."""
+    tracker, state, places = turned_by_the_odometry(0.1)
+    state, matches = tracker.update(state, spread_out(places[:2], 0.03))
+    assert matches.is_fused and state.pose[2] == pytest.approx(0.0, abs=0.005)
+    order = np.argsort(state.indices)
+    np.testing.assert_allclose(state.landmark_positions[order], places, atol=0.03)
+    assert state.distortion < 6.0
+
+
+def test_scan_with_one_landmark_that_is_tracked_corrects_the_heading():
+    tracker, state, places = turned_by_the_odometry(0.1)
+    state, matches = tracker.update(state, spread_out(places[:1], 0.03))
+    assert matches.is_fused and state.pose[2] == pytest.approx(0.0, abs=0.01)
+
+
+def test_scan_with_one_landmark_that_is_new_is_not_fused():
+    """Nothing agrees with it."""
+    tracker = Tracker(spread_out(np.array([[8.0, 4.0], [8.0, -4.0]]), 0.03))
+    before, _ = tracker.start(np.zeros(3), np.diag([0.01, 0.01, 1e-3]) ** 2)
+    after, matches = tracker.update(before, spread_out(np.array([[8.0, 4.0]]), 0.03))
+    assert len(matches.pairs) == 1 and not matches.is_fused
+    np.testing.assert_array_equal(after.mean, before.mean)
+
+
+def along_a_line(seed, share):
+    """Drive 30 m along a line of landmarks whose detections err alike while they are seen, two in each scan.
+
+    The map errs by 0.1 m, a detection by 0.1 m. Three quarters of its variance last, over 8 m.
+
+    Args:
+        seed: Determines all errors.
+        share: The share of the variance that the tracker takes as lasting.
+
+    Returns:
+        The normalized squared errors of the poses that are not doubtful, every 5 m, (n,).
+    """
+    rng, step, deviation, length = np.random.default_rng(seed), 0.5, 0.1, 8.0
+    sides = np.where(np.arange(20) % 2, 1.0, -1.0)
+    places = np.column_stack([5.0 * np.arange(20), sides * rng.uniform(4.0, 12.0, 20)])
+    known = spread_out(places + 0.1 * rng.normal(size=places.shape), 0.1)
+    tracker = Tracker(known, lasting_share=share, lasting_length=length, least_deviation=0.0, bias_deviation=1e-6)
+    surely, model = np.diag([0.1, 0.1, 0.01]) ** 2, DriftModel(heading=0.002)
+    state, truth = tracker.start(np.zeros(3), surely)[0], rng.multivariate_normal(np.zeros(3), surely)
+    lasts, independent = deviation * np.sqrt(0.75), deviation * np.sqrt(0.25)
+    lasting, rho = lasts * rng.normal(size=places.shape), np.exp(-step / length)
+    motion, squares = np.array([step, 0.0, 0.0]), []
+    C = model.covariance(motion, step)
+    for k in range(61):
+        if k:
+            truth = compose(truth, motion + rng.multivariate_normal(np.zeros(3), C))
+            state = tracker.predict(state, motion, C, extent=step)
+            lasting = rho * lasting + np.sqrt(1.0 - rho**2) * lasts * rng.normal(size=places.shape)
+        d = transform(inverse(truth), places)
+        rows = np.flatnonzero((d[:, 0] > 2.0) & (d[:, 0] < 14.0))[:2]
+        detected = d[rows] + lasting[rows] + independent * rng.normal(size=(len(rows), 2))
+        state, _ = tracker.update(state, spread_out(detected, deviation))
+        if k % 10 == 0 and k and not (tracker.is_doubtful(state) or tracker.is_lost(state)):
+            squares.append(nees(state.pose, tracker.pose_covariance(state), truth))
+    return squares
+
+
+@pytest.mark.slow
+def test_errors_of_detections_that_last_are_covered():
+    """In 95 % of the poses, if the tracker knows of them; in fewer, if it takes them as independent."""
+    squares = {share: np.concatenate([along_a_line(seed, share) for seed in range(30)]) for share in (0.0, 0.75)}
+    covered = {share: np.mean(values < chi2.ppf(0.95, 3)) for share, values in squares.items()}
+    assert len(squares[0.75]) > 150
+    assert covered[0.0] < 0.9 < 0.95 <= covered[0.75], covered
+    assert 2.0 < squares[0.75].mean() < 3.5, squares[0.75].mean()
+
+
+def test_standing_still_makes_a_pose_no_surer_than_one_scan():
+    """Errors of detections that last entirely would be the same in each scan; here, half of their variance is."""
+    places = np.array([[8.0, 4.0], [8.0, -4.0], [-5.0, 6.0]])
+    tracker = Tracker(spread_out(places, 1e-3), lasting_share=0.5, least_deviation=0.0, bias_deviation=1e-6)
+    state, deviations = tracker.start(np.zeros(3), np.diag([0.5, 0.5, 0.05]) ** 2)[0], []
+    for _ in range(50):
+        state, matches = tracker.update(state, spread_out(places, 0.1))
+        assert len(matches.pairs) == 3
+        deviations.append(np.sqrt(np.diagonal(state.pose_covariance)))
+    np.testing.assert_allclose(deviations[-1], deviations[0], rtol=0.01)
+
+
 @pytest.mark.slow
 def test_fusing_the_map_in_each_scan_is_inconsistent():
     once, afresh = [], []
@@ -659,4 +757,4 @@ def test_nothing_to_match_and_exact_maps_are_no_errors(correlation):
     assert matches.is_fused and len(matches.pairs) == 4
     np.testing.assert_allclose(state.pose, 0.0, atol=1e-9)
     state, matches = tracker.update(state, exact.select([0]))
-    assert not matches.is_fused
+    assert matches.is_fused and len(matches.pairs) == 1

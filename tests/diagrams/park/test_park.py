@@ -12,7 +12,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake_diagrams.park import ParkScenario
-from vtbdrake_diagrams.park.few_landmarks import Case, claims, thinned
+from vtbdrake_diagrams.park.few_landmarks import Case, Claims, claims, judging, tabulated, thinned
 from vtbdrake_diagrams.park.reality import (
     judged_by_positions,
     laid_onto,
@@ -139,6 +139,44 @@ def test_few_trees_are_enough_on_a_part_of_the_real_drive(drive, half):
     assert told.available > 0.5 and told.wrong == 0 and told.within(0.5) < 0.2
     nowhere = claims(begin, half.mapped, half.scenario, Case(is_mirrored=True), seed=0, trees=30)
     assert nowhere.available == 0.0
+
+
+def straight_drive(*jumps):
+    """Return a survey of a drive at 4 m/s for 200 s that jumps to the left, at (time, distance), and the wheels."""
+    times = 0.2 * np.arange(1000)
+    wheels = np.column_stack([0.8 * np.arange(1000), np.zeros((1000, 2))])
+    aside = sum(distance * (times > time) for time, distance in jumps)
+    poses = wheels + np.column_stack([np.zeros(1000), aside * np.ones(1000), np.zeros(1000)])
+    return Survey(
+        times, poses + 0.01 * np.random.default_rng(0).normal(size=poses.shape), Landmarks.empty(), 0.0
+    ), wheels
+
+
+@pytest.mark.parametrize(
+    ("jumps", "silent"),
+    [
+        ([(0.0, 0.0)], []),
+        ([(50.0, 1.0)], [(49.0, 60.9)]),  # Over a second, and for ten.
+        ([(50.0, 1.0), (90.0, -1.0)], [(49.0, 100.9)]),  # It has come back.
+        ([(50.0, 1.0), (130.0, -1.0)], [(49.0, 60.9), (129.0, 140.9)]),
+        ([(50.0, 0.1)], []),  # As the wheels allow.
+    ],
+)
+def test_survey_that_jumps_against_the_wheels_does_not_judge(jumps, silent):
+    whole, wheels = straight_drive(*jumps)
+    is_silent = np.zeros(len(whole.times), dtype=bool)
+    for start, end in silent:
+        is_silent |= (whole.times > start) & (whole.times < end)
+    np.testing.assert_allclose((~judging(whole, wheels)).sum(), is_silent.sum(), atol=3)
+    assert not judging(whole, wheels)[is_silent].any()
+
+
+def test_wrong_claims_are_counted_with_and_without_the_judge():
+    is_judged = np.array([True, True, True, False, True])
+    claimed = Claims(np.array([0.1, 0.6, 0.7, 2.0, np.nan]), np.array([0.1, 0.3, 0.1, 0.1, np.inf]), is_judged)
+    assert (claimed.wrong, claimed.is_off.sum(), claimed.judged, claimed.available) == (1, 2, 3, 0.8)
+    row = tabulated({Case(): [claimed, claimed]}).splitlines()[-1]
+    assert "80, 80 %" in row and "1, 1" in row and "2, 2" in row and "3, 3" in row
 
 
 def test_steering_and_wheels_alone_follow_the_real_path(drive):

@@ -40,8 +40,10 @@ class TrackState:
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
         unjudged: Numbers of detections and of matched ones, of landmarks that should be seen again and of seen ones,
             in the last scans, which together had too few to be judged, shape (2, 2).
+        travelled: The distance travelled by dead reckoning since the start of the track, in m.
+        seen_at: That distance at the last fused detection of each landmark in x, shape (n,) in m; -inf before.
 
-    The last six are the health of the track, see `vtbdrake.components.localization.health`.
+    From ``evidence`` to ``unjudged``, they are the health of the track, see `vtbdrake.components.localization.health`.
     """
 
     mean: Array
@@ -54,6 +56,8 @@ class TrackState:
     scatter: float = 1.0
     drift: float = 1.0
     unjudged: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    travelled: float = 0.0
+    seen_at: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def none(cls) -> TrackState:
@@ -101,6 +105,7 @@ class TrackState:
             covariance=self.covariance[np.ix_(remains, remains)],
             indices=self.indices[~mask],
             is_recent=self.is_recent[~mask],
+            seen_at=self.seen_at[~mask],
         )
 
 

@@ -18,7 +18,9 @@ scan to scan, it seems to be (Huang, Mourikis and Roumeliotis, "Observability-ba
 SLAM estimators", International Journal of Robotics Research 29, 2010). Therefore the errors here are defined as in the
 right-invariant filter (Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", arXiv:1510.06263,
 2015): an error θ of the heading displaces the carrier and each landmark, at a point p, by θ J p, where J is the
-rotation by a right angle.
+rotation by a right angle. A correction is applied by the exponential map of these errors: with the turn θ, a point
+moves by V(θ) times its step to first order, V(θ) = [sin θ I + (1 - cos θ) J] / θ. So what turns with the carrier moves
+on an arc, and what the map holds stays in its place.
 
 Dead reckoning measures a motion [t; turn] in the time T. It is too long by its share e, and its gyros have the bias g:
 
@@ -34,6 +36,14 @@ Errors of a map may be correlated: neighbours are displaced alike. With M_ij = c
 its distribution given the errors of those in the state (simple kriging). So a new landmark is expected to be displaced
 like its neighbours.
 
+Errors of detections may last: a trunk that leans or is no circle is detected beside its axis in scan after scan. Of
+the variance, the share w (``lasting_share``) has the correlation ρ = exp(-d / λ) from one sight of a landmark to the
+next, after the way d; in the sum of many sights, such errors count as independent ones with (1 + ρ) / (1 - ρ) times
+their variance. So the variance R of a detection is R [1 + 2 w ρ / (1 - ρ)] in the correction, but R in the association
+and in the test of the innovation. Who stands still learns nothing from further scans.
+
+A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees.
+
 `vtbdrake.components.localization.landmark_association` decides which landmark each detection shows,
 `vtbdrake.components.localization.health` whether the estimate may be used.
 """
@@ -41,7 +51,7 @@ like its neighbours.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf, pi
+from math import inf, pi, sin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -138,6 +148,15 @@ class Tracker:
         "Standard deviation, per axis, of the common displacement of all detections of a scan; assumed.",
         unit="m",
         ge=0.0,
+    )
+    lasting_share: float = setting(
+        0.0,
+        "The share w of the variance of one sensor's detections that lasts while a landmark is seen.",
+        ge=0.0,
+        lt=1.0,
+    )
+    lasting_length: float = setting(
+        8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
     )
     correlation: float = setting(
         0.0, "Correlation length L of the map's errors; 0 if they are independent.", unit="m", ge=0.0
@@ -243,7 +262,8 @@ class Tracker:
         P[ODOMETRY] *= decay
         P[:, ODOMETRY] *= decay
         P[ODOMETRY, ODOMETRY] += (1.0 - decay**2) * self.odometry_deviation**2
-        return state.with_arrays(mean=mean, covariance=P)
+        travelled = state.travelled + float(np.hypot(*measured[:2]))
+        return replace(state.with_arrays(mean=mean, covariance=P), travelled=travelled)
 
     def update(self, state: TrackState, landmarks: Landmarks | SensorView) -> tuple[TrackState, Matches]:
         """Return the state after a scan, and its matches.
@@ -335,6 +355,7 @@ class Tracker:
             covariance=np.block([[P, cross.T], [cross, cross[:, FIXED:] @ J.T + prior]]),
             indices=np.concatenate([state.indices, indices]),
             is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
+            seen_at=np.concatenate([state.seen_at, np.full(m, -inf)]),
         )
 
     def _map_errors(self, indices: Indices) -> Array:
@@ -386,12 +407,19 @@ class Tracker:
             pairs = np.delete(pairs, np.argmax(parts), axis=0)
         else:
             return state, _NO_MATCHES
+        nis, repeated = float(parts.sum()), self._repeated(state, rows)
+        if repeated.any():
+            S += block_diag(*(repeated[:, None, None] * detections.covariances[pairs[:, 0]]))
+            factor = cho_factor(S, lower=True)
+            weighted = cho_solve(factor, nu)
         K = cho_solve(factor, PHt.T).T
         P = state.covariance - PHt @ K.T
         mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
+        seen_at = state.seen_at.copy()
+        seen_at[rows] = state.travelled
         is_in_view = view.is_in_view(in_level_frame(state, state.landmark_positions), share=inf)
         is_recent = np.where(is_in_view, np.isin(state.indices, pairs[:, 1]), state.is_recent)
-        fused = state.with_arrays(mean=mean, covariance=P, is_recent=is_recent)
+        fused = state.with_arrays(mean=mean, covariance=P, is_recent=is_recent, seen_at=seen_at)
         distance = np.hypot(*(fused.landmark_positions - mean[:2]).T)
         far = distance > self.horizon
         far[np.argsort(distance)[self.most :]] = True
@@ -399,7 +427,20 @@ class Tracker:
         places = self.landmarks.positions[near.indices]
         M = self._map_errors(near.indices)
         distortion, scatter = health.distortion(places, near.landmark_positions - places, M)
-        return replace(near, distortion=distortion, scatter=scatter), Matches(pairs, float(parts.sum()), is_fused=True)
+        return replace(near, distortion=distortion, scatter=scatter), Matches(pairs, nis, is_fused=True)
+
+    def _repeated(self, state: TrackState, rows: Indices) -> Array:
+        """Return 2 w ρ / (1 - ρ), by which multiple of themselves the variances of detections grow, (m,).
+
+        Args:
+            state: The state.
+            rows: The detected landmarks, as places in the state.
+        """
+        if self.lasting_share == 0.0:
+            return np.zeros(len(rows))
+        way = (state.travelled - state.seen_at[rows]) / self.lasting_length
+        rho = np.exp(-np.maximum(way, 1e-6))
+        return 2.0 * self.lasting_share * rho / (1.0 - rho)
 
     def _expected(self, state: TrackState, rows: Indices, *, is_scan: bool) -> tuple[Array, Array]:
         """Return the expected detections of landmarks of the state in H, (m, 2), and the derivatives (m, 2, 6).
@@ -436,14 +477,13 @@ def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
         P: The covariance after the correction, as errors displace points about that estimate, (N, N).
         step: The correction to first order, (N,).
     """
-    J, turn, around = rotation(pi / 2.0), step[2], mean[FIXED:].reshape(-1, 2) - mean[:2]
-    corrected = mean + step
-    # Landmarks turn about the carrier on arcs, not on tangents.
-    corrected[FIXED:] += (around @ (rotation(turn) - np.eye(2) - turn * J).T).ravel()
-    # An error of the heading displaces the corrected points by this much more.
-    lever = np.zeros(len(mean))
-    lever[:2] = J @ step[:2]
-    lever[FIXED:] = ((corrected - mean)[FIXED:].reshape(-1, 2) @ J.T).ravel()
+    J, turn, corrected, lever = rotation(pi / 2.0), step[2], mean + step, np.zeros(len(mean))
+    V = np.sinc(turn / pi) * np.eye(2) + np.sinc(0.5 * turn / pi) * sin(0.5 * turn) * J
+    for points in (slice(0, 2), slice(FIXED, None)):
+        moved = step[points].reshape(-1, 2) @ V.T
+        corrected[points] = mean[points] + moved.ravel()
+        # An error of the heading displaces the corrected points by this much more.
+        lever[points] = (moved @ J.T).ravel()
     P = P + np.outer(lever, P[2])
     return corrected, P + np.outer(P[:, 2], lever)
 
