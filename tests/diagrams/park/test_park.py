@@ -1,7 +1,7 @@
 """A car that localizes itself in a park: simulated, and on recordings of a real one."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ import pytest
 from tests.real import recordings
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import compose, inverse, transform
+from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
+from vtbdrake.components.localization.range_bearing import range_bearing_landmarks
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake_diagrams.park import ParkScenario
 from vtbdrake_diagrams.park.few_landmarks import Case, Claims, claims, judging, tabulated, thinned
@@ -127,6 +128,36 @@ def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path, drive, half)
     assert judgement.rms < 2.5 and judgement.wrong == 0 and judgement.count > 20
     nowhere, _ = localized(end, half.with_map(tmp_path, mirrored=True), tmp_path / "mirrored.lcm")
     assert not nowhere.has_pose.any()
+
+
+@pytest.mark.slow
+def test_errors_of_real_detections_last_while_the_car_moves_on(drive, half):
+    """A third of their variance along the ray, for some 8 m; more, as the trees are fitted to the same detections."""
+    detected = drive.between(0.0, 200.0).log.sense["trees"]
+    ways = np.cumsum([0.0, *np.hypot(*np.diff(half.mapped.poses[:, :2], axis=0).T)])
+    errors: dict[int, list] = {}
+    for way, pose, row in zip(ways, half.mapped.poses, detected.values, strict=True):
+        scan = range_bearing_landmarks(row, half.scenario.detector)
+        for place, seen in zip(transform(pose, scan.positions), scan.positions, strict=True):
+            gaps = half.mapped.trees.positions - place
+            k = int(np.argmin(np.hypot(*gaps.T)))
+            ray = seen - [half.scenario.detector.x, half.scenario.detector.y]
+            along = -gaps[k] @ rotation(pose[2]) @ ray / np.hypot(*ray)
+            if np.hypot(*gaps[k]) < 0.4:
+                errors.setdefault(k, []).append((way, along))
+
+    def correlation(least, most):
+        products = [
+            (a * b, 0.5 * (a * a + b * b))
+            for seen in errors.values()
+            for (way, a), (later, b) in combinations(seen, 2)
+            if least < later - way <= most
+        ]
+        assert len(products) > 1000
+        return np.divide(*np.sum(products, axis=0))
+
+    near, farther, far = correlation(0.2, 1.0), correlation(6.0, 10.0), correlation(20.0, 40.0)
+    assert 0.3 < near < 0.5 and 0.2 * near < farther < 0.5 * near and abs(far) < 0.1
 
 
 @pytest.mark.slow
