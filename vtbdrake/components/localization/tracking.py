@@ -149,15 +149,6 @@ class Tracker:
         unit="m",
         ge=0.0,
     )
-    lasting_share: float = setting(
-        0.0,
-        "The share w of the variance of one sensor's detections that lasts while a landmark is seen.",
-        ge=0.0,
-        lt=1.0,
-    )
-    lasting_length: float = setting(
-        8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
-    )
     correlation: float = setting(
         0.0, "Correlation length L of the map's errors; 0 if they are independent.", unit="m", ge=0.0
     )
@@ -192,6 +183,15 @@ class Tracker:
     )
     distortion_gate: float = setting(
         0.99999, "The share of right maps that are not doubtful in one test of the distortion.", gt=0.0, lt=1.0
+    )
+    lasting_share: float = setting(
+        0.0,
+        "The share w of the variance of one sensor's detections that lasts while a landmark is seen.",
+        ge=0.0,
+        lt=1.0,
+    )
+    lasting_length: float = setting(
+        8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
     )
     _association: Association = field(init=False, repr=False)
 
