@@ -34,8 +34,8 @@ def make_dps(
 
     Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the
     torso's), ``joint_encoders`` (18, rad), ``foot_contact`` (6, 0 or 1) and the commands ``heading`` (the yaw to walk
-    towards, rad, in the world) and ``walk`` (0 stands, 1 walks the full stroke). Output port: ``joint_position`` (18
-    targets, rad, in the order of JOINT_NAMES, which equals the model's actuators').
+    towards, rad, in the world) and ``walk`` (0 stands, 1 walks the full stroke, -1 backwards). Output port:
+    ``joint_position`` (18 targets, rad, in the order of JOINT_NAMES, which equals the model's actuators').
 
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through, and what the sensors see
     reaches the command four periods later. Feet are lifted by ``clearance`` (m). With a

@@ -120,10 +120,12 @@ def make_navigator(*, period: float) -> System:
 
     Position: ``position`` (x, y) integrates the visual odometry. Leg odometry would not notice when all feet slip.
 
-    Course: the robot is to walk along the line through the point p_0 where the command began (walk became positive, or
-    the heading changed), in the direction of the heading. With the distance e to the left of that line,
+    Course: the robot is to walk along the line through the point p_0 where the command began (walk took another sign,
+    or the heading changed), in the direction of the heading. With the distance e to the left of that line,
 
-        course = heading - clamp(course_gain e, course_limit).
+        course = heading - clamp(course_gain e, course_limit),
+
+    and with the other sign where it walks backwards (a negative walk) along that line.
 
     Slip: ``slip`` is the difference (x, y) between the velocities over ground of leg odometry and visual odometry,
     behind a first-order low-pass with the time constant ``slip_time``; ``slipping`` is 1 while it is larger than
@@ -139,13 +141,14 @@ def make_navigator(*, period: float) -> System:
         slip = x.slip + share * ((u.leg_position - x.last_step) / period - velocity - x.slip)
         tips = casadi.logic_or(casadi.fabs(u.rpy[0]) > p.tip_angle, casadi.fabs(u.rpy[1]) > p.tip_angle)
         tipped = casadi.if_else(tips, 1.0, x.tipped)
-        walks = u.commanded_walk > 0.0
-        goes_on = casadi.logic_and(x.under_way != 0.0, u.commanded_heading == x.heading)
+        way = casadi.sign(u.commanded_walk)
+        walks = way != 0.0
+        goes_on = casadi.logic_and(x.under_way == way, u.commanded_heading == x.heading)
         begins = casadi.logic_and(walks, casadi.logic_not(goes_on))
         origin = casadi.if_else(begins, position, x.origin)
         apart = position - origin
         aside = casadi.cos(u.commanded_heading) * apart[1] - casadi.sin(u.commanded_heading) * apart[0]
-        correction = casadi.if_else(walks, clamp(p.course_gain * aside, -p.course_limit, p.course_limit), 0.0)
+        correction = way * clamp(p.course_gain * aside, -p.course_limit, p.course_limit)
         return {
             "course": wrap(u.commanded_heading - correction),
             "walk": casadi.if_else(tipped, 0.0, u.commanded_walk),
@@ -153,19 +156,19 @@ def make_navigator(*, period: float) -> System:
             "slip": slip,
             "slipping": casadi.norm_2(slip) > p.slip_limit,
             "tipped": tipped,
-            "under_way": walks,
+            "under_way": way,
             "origin": origin,
             "heading": u.commanded_heading,
             "last_step": u.leg_position,
         }
 
-    flag, point = Quantity(0.0, bounds=(0.0, 1.0)), Quantity([0.0, 0.0], "m")
+    flag, sign, point = Quantity(0.0, bounds=(0.0, 1.0)), Quantity(0.0, bounds=(-1.0, 1.0)), Quantity([0.0, 0.0], "m")
     memory = NamedVector(
         position=point,
         slip=Quantity([0.0, 0.0], "m/s"),
         slipping=flag,
         tipped=flag,
-        under_way=flag,
+        under_way=sign,
         origin=point,
         heading=Quantity(0.0, "rad"),
         last_step=point,
@@ -182,7 +185,7 @@ def make_navigator(*, period: float) -> System:
         step,
         state={
             "course": NamedVector(course=Quantity(0.0, "rad")),
-            "walk": NamedVector(walk=flag),
+            "walk": NamedVector(walk=sign),
             "memory": memory,
         },
         inputs={"input": _INPUT},

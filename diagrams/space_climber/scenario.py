@@ -96,7 +96,7 @@ class SpaceClimberScenario(Scenario):
             ],
             commands=[
                 Signal("heading", size=1, unit="rad", lower=-np.pi, upper=np.pi),
-                Signal("walk", size=1, lower=0.0, upper=1.0, default=1.0),
+                Signal("walk", size=1, lower=-1.0, upper=1.0, default=1.0),
             ],
         )
 

@@ -44,8 +44,8 @@ def make_gait_generator(gait: Gait, *, period: float, morphology: Morphology, cl
 
     ``input`` is [roll, pitch, yaw, x, y, height, heading, walk]: the estimated pose and the commands.
 
-    * Start and stop: ``walk`` in [0, 1] scales stroke, clearance and turning. The level follows it at the rate
-      1 / ``ramp_time``; standing is a level of 0 with a phase that rests.
+    * Start and stop: ``walk`` in [-1, 1] scales stroke, clearance and turning; less than 0 walks backwards. The level
+      follows it at the rate 1 / ``ramp_time``; standing is a level of 0 with a phase that rests.
     * Heading: the robot walks along its own x axis and turns at ``heading_gain * (heading - yaw)``, within
       +- ``yaw_rate_limit``.
     * Posture: the plane of the feet's heights leans against the torso's tilt. The lean grows with ``posture_gain``
@@ -59,22 +59,22 @@ def make_gait_generator(gait: Gait, *, period: float, morphology: Morphology, cl
         tilt = casadi.vertcat(u.roll, u.pitch)
         lean = clamp(x.lean + p.posture_gain * period * tilt, -p.lean_limit, p.lean_limit)
         reach = period / p.ramp_time
-        level = x.level + clamp(clamp(u.walk, 0.0, 1.0) - x.level, -reach, reach)
+        level = x.level + clamp(clamp(u.walk, -1.0, 1.0) - x.level, -reach, reach)
         turn = clamp(p.heading_gain * wrap(u.heading - u.yaw), -p.yaw_rate_limit, p.yaw_rate_limit)
-        next_phase = x.phase + period / p.period
+        size, next_phase = casadi.fabs(level), x.phase + period / p.period
         moved = gait.advanced(
             x.feet,
             nominal=casadi.DM(stance[:, :2]),
             phase=x.phase,
             next_phase=next_phase,
             forward=level * period * gait.speed(p.stroke, p.period),
-            turn=level * period * turn,
+            turn=size * period * turn,
             stance_steps=gait.duty * p.period / period,
         )
-        walks = level > 0.0
+        walks = size > 0.0
         phase, feet = casadi.if_else(walks, fraction(next_phase), x.phase), casadi.if_else(walks, moved, x.feet)
         ground = morphology.foot_radius - p.height - lean[1] * feet[:, 0] + lean[0] * feet[:, 1]
-        heights = ground + level * p.clearance * gait.heights(phase)
+        heights = ground + size * p.clearance * gait.heights(phase)
         angles = legs.angles(casadi.horzcat(feet, heights))
         return {
             "phase": phase,
@@ -86,7 +86,7 @@ def make_gait_generator(gait: Gait, *, period: float, morphology: Morphology, cl
 
     memory = NamedVector(
         phase=Quantity(0.0, "cycle", (0.0, 1.0)),
-        level=Quantity(0.0, bounds=(0.0, 1.0)),
+        level=Quantity(0.0, bounds=(-1.0, 1.0)),
         lean=Quantity([0.0, 0.0], "rad"),
         feet=Quantity(stance[:, :2], "m"),
     )

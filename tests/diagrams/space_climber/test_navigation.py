@@ -40,6 +40,13 @@ def test_course_leads_back_to_the_line(sideways: float, correction: float) -> No
     assert context.get_discrete_state(1)[0] == 1.0
 
 
+def test_backwards_the_course_turns_the_other_way() -> None:
+    """It walks backwards along the line and drifts to its left: only a turn to the left takes its rear to the right."""
+    context = navigate(5.0 - 0.5 * PERIOD, v=[-0.2, 0.1, 0.0], walk=[-1.0])
+    assert context.get_discrete_state(0)[0] == pytest.approx(0.3 * 0.1 * 5.0, abs=0.3 * 0.1 * PERIOD + 1e-12)
+    assert context.get_discrete_state(1)[0] == -1.0
+
+
 def test_standing_legs_that_walk_on_the_spot_slip() -> None:
     """Leg odometry that moves at 0.2 m/s, against eyes that see no motion."""
     system = make_navigator(period=PERIOD)

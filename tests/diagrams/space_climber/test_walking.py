@@ -75,6 +75,15 @@ def test_walks_straight_and_level_at_one_stroke_per_stance(gait: str, gravity: f
     assert track.lowest_foot.max() < m.foot_radius + 0.002  # always a foot on the ground
 
 
+def test_walks_backwards_as_fast_as_forwards() -> None:
+    track = simulate(walk=-1.0)
+    start, end = np.searchsorted(track.time, [1.99, 7.99])
+    way = track.position[end] - track.position[start]
+    assert way[0] / 6.0 == pytest.approx(-0.2, rel=0.05)
+    assert abs(way[1]) < 0.02 * abs(way[0])
+    assert np.abs(track.rpy).max() < np.radians(2.0)
+
+
 def test_perceived_pose_follows_the_true_one() -> None:
     track = simulate(heading=0.3)
     roll, pitch, yaw, x, y, height = track.estimate
