@@ -79,12 +79,14 @@ class BelievedTerrain:
         rocks: The rocks, as objects of a semantic world model.
         friction: Friction of feet and ground at the vertices of ``ground``, shape (n, m); `FRICTION` by default.
         friction_variance: The variance of its error, likewise.
+        obstacles: Places (x, y) in m where it walked and came no further, shape (k, 2).
     """
 
     ground: GroundMap
     rocks: WorldModel
     friction: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     friction_variance: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    obstacles: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 
     def __post_init__(self) -> None:
         for name, value in (("friction", FRICTION[0]), ("friction_variance", FRICTION[1] ** 2)):
@@ -153,6 +155,10 @@ class BelievedTerrain:
             friction_variance=(1.0 - gain) * self.friction_variance,
         )
 
+    def after_block(self, place: ArrayLike) -> BelievedTerrain:
+        """Return the belief after the robot walked towards a place (x, y) in m, and came no further."""
+        return replace(self, obstacles=np.vstack([self.obstacles, np.asarray(place, dtype=float)]))
+
     def slopes(self) -> Array:
         """Return the gradients of the believed heights at the vertices, shape (2, n, m)."""
         return np.stack(np.gradient(self.ground.heights, self.ground.cell))
@@ -163,7 +169,6 @@ class BelievedTerrain:
         near: Sequence[float],
         radius: float,
         heights: Array | None = None,
-        towards: float | None = None,
         datum: float = 0.0,
     ) -> WorldModel:
         """Return the semantic world model around a place: patches of ground, and rocks that stand on them.
@@ -175,7 +180,6 @@ class BelievedTerrain:
             near: The place (x, y) in m.
             radius: How far it reaches, in m.
             heights: Heights at the vertices, for example a draw; the believed ones by default.
-            towards: Azimuth in rad behind which only the next metres are needed; None for all around.
             datum: The height of the world's origin in m, over which the heights in the world are.
 
         Raises:
@@ -187,12 +191,7 @@ class BelievedTerrain:
         vertices = ground.vertices().reshape(*z.shape, 2)
         middles = 0.25 * (vertices[:-1, :-1] + vertices[1:, :-1] + vertices[:-1, 1:] + vertices[1:, 1:])
         offsets = middles - np.asarray(near, dtype=float)
-        away = np.hypot(offsets[..., 0], offsets[..., 1])
-        in_reach = away < radius
-        if towards is not None:
-            along = offsets @ [np.cos(towards), np.sin(towards)]
-            in_reach &= (away < 2.5) | (along > 0.0)
-        cells = np.argwhere(in_reach)
+        cells = np.argwhere(np.hypot(offsets[..., 0], offsets[..., 1]) < radius)
         corner = cells[:, :1] * z.shape[1] + cells[:, 1:]
         numbers = corner + np.array([0, z.shape[1], z.shape[1] + 1, 1])
         deviations = ground.deviations(np.unique(numbers))

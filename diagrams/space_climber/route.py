@@ -2,9 +2,9 @@ r"""Routes over believed terrain: the cost from every place to beyond the rim, a
 
 A metre costs what it takes in time, in metres on level ground: on a slope s with the friction mu the robot advances by
 1 - (s / mu)^3.7 of its steps (`SLIP_EXPONENT`), so a metre costs the inverse of it, `STEEPEST` at most. A rock that is
-higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. The
-costs to the goal are the costs of shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths
-from one place).
+higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. Around a
+place where the robot came no further a metre costs `OBSTACLE_COST` more. The costs to the goal are the costs of
+shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths from one place).
 """
 
 from __future__ import annotations
@@ -29,6 +29,12 @@ ROCK_COST = 4.0
 
 HALF_WIDTH = 0.45
 """From the robot's middle to the outside of its feet, in m."""
+
+OBSTACLE_COST = 8.0
+"""What a metre costs more, in m, where the robot walked before and came no further."""
+
+OBSTACLE_RADIUS = 0.9
+"""How far around such a place, in m: half of its width, and as much again."""
 
 CLEARANCE = 0.1
 """Height up to which the robot steps over a rock, in m."""
@@ -103,6 +109,10 @@ def route(terrain: BelievedTerrain) -> Route:
             reach = 0.5 * rock.number("width", unit="m") + HALF_WIDTH
             x, y = rock.p_WoOo_W[:2]
             price[np.hypot(places[0] - x, places[1] - y) < reach] += ROCK_COST
+    felt = np.zeros(price.shape, dtype=bool)
+    for x, y in terrain.obstacles:
+        felt |= np.hypot(places[0] - x, places[1] - y) < OBSTACLE_RADIUS
+    price[felt] += OBSTACLE_COST
     # Near the axis, where it starts, the robot may be anywhere.
     price[(np.abs(np.arctan2(places[1], places[0])) > WIDEST) & (np.hypot(*places) > 5.0)] += STEEPEST
     return Route(ground.origin, _costs(price, np.hypot(*places) > GOAL_RADIUS))

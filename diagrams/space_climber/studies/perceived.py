@@ -3,7 +3,9 @@
 Before it starts, the robot has a survey from orbit, which is coarse and partly wrong (`survey`). At each stop it looks
 around with its laser scanner, adds what it sees to its semantic world model, builds a mental world of that, tries
 headings there from its belief, and walks `LEG` seconds in the best one. Slip that it felt on the way is friction of the
-patches it walked on. It never sees the crater's seed, and of the true terrain nothing but scans and its own motion.
+patches it walked on. Where it is blocked, it goes back as it came, remembers the place as an obstacle, looks and
+decides again; if no heading gains much, it tries to walk backwards, too. It never sees the crater's seed, and of the
+true terrain nothing but scans and its own motion.
 
 What a heading is worth is the believed cost to the rim (`route`) at the end of its rollout: less is better. The rollout
 tells what the robot's feet do among the rocks and on the slope next to it, the route what lies beyond.
@@ -57,8 +59,8 @@ PLACE = ("sim.sys.climber.base.x", "sim.sys.climber.base.y")
 ROCK_COVER = 0.03
 """The share of the ground that rocks cover, as at the least rocky landing sites; see `terrain`."""
 
-FIRST_SEED = 1000
-"""Craters from this seed on are judged; those below are for looking at."""
+FIRST_SEED = 1200
+"""Craters from this seed on are judged; those below were looked at."""
 
 LEG = 20.0
 """How long the robot walks until it looks again, in s: 3.8 m on level ground."""
@@ -93,8 +95,20 @@ LONGEST = 450.0
 RADIUS = SPEED * TRIED + 3.0
 """How far a mental world reaches, in m."""
 
-IMPATIENT = 90.0
-"""After how long without progress away from the axis a walk is given up, in s: the way may lead aside."""
+TRIED_BACKWARDS = 1.0
+"""If no heading gains as much, in m, walking backwards is tried, too."""
+
+BLOCKED_WITHIN = 10.0
+"""A robot that came less far than `BLOCKED_WAY` within this time, in s, is blocked."""
+
+BLOCKED_WAY = 0.4
+"""See `BLOCKED_WITHIN`; in m. On level ground it would be 1.9 m."""
+
+GOING_BACK = 10.0
+"""How long a blocked robot goes back, as it came, before it looks, in s: 1.6 m on level ground."""
+
+BLOCKED_AHEAD = 0.6
+"""How far ahead of its middle a blocked robot believes the obstacle to be, in m: beyond its front feet."""
 
 HEADINGS = np.linspace(-LIMIT, LIMIT, 13)
 """Fixed headings in rad, 7.5 deg apart: a crater is passable if one passes; the least steep one is a strategy."""
@@ -119,14 +133,16 @@ class Stop:
         time: Simulated time in s.
         place: Believed place (x, y, z) in m.
         heading: Heading it went on with, in rad; None if it stood still.
-        tried: Headings in rad that were tried, and by how much each lowers the cost to the rim, in m.
+        walk: 1 if it walked on in that heading, -1 if it walked backwards.
+        tried: Headings in rad that were tried, each with its walk, and by how much it lowers the cost to the rim, in m.
         said: Why the decision is poor, or why it stands still; empty if it is neither.
     """
 
     time: float
     place: tuple[float, float, float]
     heading: float | None
-    tried: tuple[tuple[float, float], ...] = ()
+    walk: float = 1.0
+    tried: tuple[tuple[float, float, float], ...] = ()
     said: str = ""
 
 
@@ -174,7 +190,6 @@ def true_world(seed: int) -> CraterScenario:
     return replace(
         differing(seed, seed).scenario,
         rock_cover=ROCK_COVER,
-        patience=IMPATIENT,
         scans=True,
         simulator_config=SimulatorConfig(),
         plant_config=MultibodyPlantConfig(
@@ -213,6 +228,11 @@ class Rover:
         """Return where the robot believes to be, (x, y) in m."""
         place: Array = np.array(self.testbed.read(self.context, "dps.impl.navigator.position"))
         return place
+
+    @property
+    def yaw(self) -> float:
+        """Return the believed azimuth of the robot's x axis in rad."""
+        return float(self.testbed.read(self.context, "dps.env.yaw"))
 
     @property
     def stepped(self) -> Array:
@@ -390,46 +410,67 @@ class Explorer:
         begin = time.process_time()
         gains = self._try(rover, way, ahead)
         self.thinking += time.process_time() - begin
-        heading, gain = max(gains.items(), key=lambda pair: pair[1])
-        tried = tuple((float(angle), float(value)) for angle, value in gains.items())
+        (heading, walk), gain = max(gains.items(), key=lambda pair: pair[1])
+        tried = tuple((angle, direction, value) for (angle, direction), value in gains.items())
         if gain < LEAST_GAIN:
             said = f"poor: of {len(gains)} headings none lowers the cost to the rim by {LEAST_GAIN:g} m"
-        return Stop(rover.time, here, heading, tried, said)
+        return Stop(rover.time, here, heading, walk, tried, said)
 
-    def _try(self, rover: Rover, way: Route, ahead: float) -> dict[float, float]:
-        """Return for the headings that were tried by how much they lower the cost to the rim, in m: at worst."""
-        rover.testbed.write(rover.context, {HEADING: ahead, WALK: 1.0})
-        start = way.cost_at(rover.place)
-        along = self._gains(rover, way, ahead, Budget(rollouts=1))
+    def _try(self, rover: Rover, way: Route, ahead: float) -> dict[tuple[float, float], float]:
+        """Return for the headings (rad) and walks that were tried by how much they lower the cost to the rim, in m."""
+        start, grounds = way.cost_at(rover.place), self._grounds(rover.place)
+        along = self._gains(rover, way, grounds, (ahead, 1.0), Budget(rollouts=1))
         # As far as the route goes down on the level, over the horizon and without a rock.
         end = way.path(rover.place, length=SPEED * TRIED)[-1]
         if min(along.values(), default=-np.inf) >= ENOUGH * (start - way.cost_at(end)):
             return along
-        return self._gains(rover, way, ahead, None)
+        gains = self._gains(rover, way, grounds, (ahead, 1.0), None)
+        if max(gains.values()) < TRIED_BACKWARDS:
+            gains |= self._gains(rover, way, grounds, (rover.yaw, -1.0), None)
+        return gains
 
-    def _gains(self, rover: Rover, way: Route, ahead: float, budget: Budget | None) -> dict[float, float]:
-        """Return for each heading (rad) the least gain in the believed world and in draws of it, in m.
+    def _grounds(self, place: Array) -> list[list[FixedPiece]]:
+        """Return the pieces of the believed world around a place (x, y) in m, and of draws of it."""
+        ground, pieces = self.terrain.ground, mental_reasoner()[3].pieces
+        draws = [ground.draw(np.random.default_rng(number)) for number in range(1, self.draws + 1)]
+        return [pieces(self._world(place, heights=heights)) for heights in (None, *draws)]
+
+    def _gains(
+        self,
+        rover: Rover,
+        way: Route,
+        grounds: Sequence[Sequence[FixedPiece]],
+        first: tuple[float, float],
+        budget: Budget | None,
+    ) -> dict[tuple[float, float], float]:
+        """Return for headings (rad) and a walk the least gain in the believed world and in draws of it, in m.
 
         A failed rollout is a loss of all.
+
+        Args:
+            rover: The robot.
+            way: The route.
+            grounds: The pieces of the believed world, and of draws of it.
+            first: Heading and walk that are tried first; the walk is the same for all.
+            budget: How many headings are tried.
         """
-        reasoner, executor, quality, scenario = mental_reasoner()
-        quality.route, start = way, way.cost_at(rover.place)
-        gains: dict[float, float] = {}
-        for number in range(self.draws + 1):
-            heights = self.terrain.ground.draw(np.random.default_rng(number)) if number else None
-            executor.stand_on(scenario.pieces(self._world(rover.place, heights=heights)))
+        reasoner, executor, quality, _ = mental_reasoner()
+        (ahead, walk), quality.route, start = first, way, way.cost_at(rover.place)
+        rover.testbed.write(rover.context, {HEADING: ahead, WALK: walk})
+        gains: dict[tuple[float, float], float] = {}
+        for pieces in grounds:
+            executor.stand_on(pieces)
             for candidate in reasoner.decide(rover.testbed, rover.context, budget=budget).candidates:
-                heading = float(candidate.values.get(HEADING, ahead))
-                value = start - candidate.quality if np.isfinite(candidate.quality) else -start
-                gains[heading] = min(gains.get(heading, np.inf), value)
+                key = float(candidate.values.get(HEADING, ahead)), walk
+                value = float(start - candidate.quality) if np.isfinite(candidate.quality) else -start
+                gains[key] = min(gains.get(key, np.inf), value)
         return gains
 
     def _world(self, place: ArrayLike, *, heights: Array | None = None) -> WorldModel:
         """Return ground and rocks around a place, over the believed ground at this place."""
         near = np.asarray(place, dtype=float).tolist()
         datum = float(self.terrain.ground.height([near], heights)[0])
-        # Headings are tried to either side of the x axis.
-        return self.terrain.world_model(near=near, radius=RADIUS, towards=0.0, heights=heights, datum=datum)
+        return self.terrain.world_model(near=near, radius=RADIUS, heights=heights, datum=datum)
 
     def mental(self, place: ArrayLike, *, heights: Array | None = None) -> BelievedCraterScenario:
         """Return the mental world around a place as a scenario to simulate: what the robot believes.
@@ -440,8 +481,16 @@ class Explorer:
         """
         return replace(mental_reasoner()[3], world=self._world(place, heights=heights))
 
-    def felt(self, path: Sequence[Array], stepped: float) -> None:
-        """Take what the robot felt on its way: how far it came by how far it stepped."""
+    def felt(self, path: Sequence[Array], stepped: float, *, blocked_by: ArrayLike | None = None) -> None:
+        """Take what the robot felt on its way: how far it came by how far it stepped, and what blocked it.
+
+        Args:
+            path: Where it was, (x, y) from the begin to the end, in m.
+            stepped: How far its legs stepped, in m.
+            blocked_by: The place (x, y) in m towards which it came no further.
+        """
+        if blocked_by is not None:
+            self.terrain = self.terrain.after_block(blocked_by)
         way = float(np.linalg.norm(np.diff(np.array(path), axis=0), axis=1).sum())
         if stepped > 0.5:
             self.terrain = self.terrain.after_slip(path, way / stepped)
@@ -529,25 +578,34 @@ class Site:
         explorer = Explorer(self.world, self.terrain, tries=strategy == "reasoned", draws=draws)
         way = route(self.terrain)
         stops: list[Stop] = []
-        while not rover.ended and rover.time < LONGEST:
-            if strategy in LOOKING_STRATEGIES:
-                rover.advance(LOOKING, walk=0.0)
-                stops.append(explorer.decide(rover))
-            else:
+        while not _is_over(rover):
+            if strategy not in LOOKING_STRATEGIES:
                 x, y = rover.place.tolist()
                 stops.append(Stop(rover.time, (x, y, 0.0), way.heading([x, y])))
-            if stops[-1].heading is None or rover.ended:
+                rover.advance(min(LEG, LONGEST - rover.time), heading=way.heading([x, y]), walk=1.0)
+                continue
+            rover.advance(LOOKING, walk=0.0)
+            stops.append(explorer.decide(rover))
+            if stops[-1].heading is None or _is_over(rover):
                 break
-            self._leg(rover, explorer, stops[-1].heading)
+            self._leg(rover, explorer, stops[-1].heading, stops[-1].walk)
         return _walk(self.seed, strategy, rover, stops, explorer.thinking)
 
     @staticmethod
-    def _leg(rover: Rover, explorer: Explorer, heading: float) -> None:
-        path, begun = [rover.place], rover.stepped
-        for _ in range(4):
-            rover.advance(0.25 * LEG, heading=heading, walk=1.0)
+    def _leg(rover: Rover, explorer: Explorer, heading: float, walk: float) -> None:
+        """Walk a leg; a robot that is blocked on its way goes back a little, as it came."""
+        path, begun, blocked_by = [rover.place], rover.stepped, None
+        within, end = round(BLOCKED_WITHIN / SEGMENT), rover.time + LEG
+        while not _is_over(rover, end) and blocked_by is None:
+            rover.advance(SEGMENT, heading=heading, walk=walk)
             path.append(rover.place)
-        explorer.felt(path, float(np.linalg.norm(rover.stepped - begun)))
+            if len(path) > within and np.linalg.norm(path[-1] - path[-1 - within]) < BLOCKED_WAY:
+                blocked_by = rover.place + walk * BLOCKED_AHEAD * np.array([np.cos(rover.yaw), np.sin(rover.yaw)])
+        explorer.felt(path, float(np.linalg.norm(rover.stepped - begun)), blocked_by=blocked_by)
+        if blocked_by is not None:
+            yaw, end = rover.yaw, rover.time + GOING_BACK
+            while not _is_over(rover, end):
+                rover.advance(SEGMENT, heading=yaw, walk=-walk)
 
     def all_fixed(self, headings: Sequence[float]) -> list[Walk]:
         """Walk in each of the headings (rad) until the end, side by side in the compiled world."""
@@ -575,6 +633,10 @@ class Site:
 def heading_name(heading: float) -> str:
     """Return the name of the walk in one heading (rad), which is none of `STRATEGIES`."""
     return f"{np.degrees(heading):g} deg"
+
+
+def _is_over(rover: Rover, end: float = LONGEST) -> bool:
+    return bool(rover.ended) or rover.time > min(end, LONGEST) - 0.5 * SEGMENT
 
 
 def _walk(seed: int, strategy: str, rover: Rover, stops: Sequence[Stop] = (), thinking: float = 0.0) -> Walk:
@@ -679,7 +741,7 @@ def older(path: Path = RESULTS) -> int:
 
 def _read_walk(record: Mapping[str, Any]) -> Walk:
     stops = tuple(
-        Stop(stop["time"], tuple(stop["place"]), stop["heading"], tuple(map(tuple, stop["tried"])), stop["said"])
+        Stop(**{**stop, "place": tuple(stop["place"]), "tried": tuple(map(tuple, stop["tried"]))})
         for stop in record["stops"]
     )
     values = {field.name: record[field.name] for field in fields(Walk)}
@@ -705,8 +767,9 @@ def draw(walk: Walk) -> Figure:
     listed = site.terrain.rocks.positions()
     axes.plot(*listed[:, :2].T, "s", color="tab:red", markersize=5, fillstyle="none", label="boulders of the survey")
     for stop in walk.stops:
-        for heading, gain in stop.tried:
-            end = np.array(stop.place[:2]) + max(gain, 0.0) * np.array([np.cos(heading), np.sin(heading)])
+        for heading, direction, gain in stop.tried:
+            along = direction * np.array([np.cos(heading), np.sin(heading)])
+            end = np.array(stop.place[:2]) + max(gain, 0.0) * along
             axes.plot(*np.column_stack([stop.place[:2], end]), color="tab:blue", alpha=0.4, linewidth=1.0)
     places = np.array([*(stop.place[:2] for stop in walk.stops), walk.end[:2]])
     axes.plot(*places.T, "o-", color="tab:blue", markersize=4, label="stops; tried headings, as long as they gain")

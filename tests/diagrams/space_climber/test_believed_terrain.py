@@ -159,3 +159,14 @@ def test_a_route_goes_around_rocks_and_steep_ground() -> None:
     over = route(BelievedTerrain(replace(flat, survey=steep), WorldModel()))
     assert over.cost_at([20.0, 10.0]) > free.cost_at([20.0, 10.0]) + 6.0
     assert over.heading([20.0, 0.0], ahead=5.0) < -0.2
+
+
+def test_a_route_goes_around_where_the_robot_came_no_further() -> None:
+    """Around the place it costs 8 m more per metre: the way aside is shorter, with half a robot between."""
+    flat = GroundMap.surveyed((-6.0, -34.0), 1.0, np.zeros((55, 69)), deviation=0.3, range=8.0)
+    felt = BelievedTerrain(flat, WorldModel()).after_block([22.0, 0.0])
+    assert np.abs(route(BelievedTerrain(flat, WorldModel())).path([20.0, 0.0], length=5.0)[:, 1]).max() == 0.0
+    path = route(felt).path([20.0, 0.0], length=5.0)
+    assert np.hypot(*(path - [22.0, 0.0]).T).min() > 0.45
+    # Twice the same place is no higher obstacle.
+    assert route(felt.after_block([22.0, 0.0])).cost_at([22.0, 0.0]) == route(felt).cost_at([22.0, 0.0])

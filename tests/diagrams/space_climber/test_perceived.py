@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.geometry import Role
+from pydrake.geometry import Box, Role
 from pydrake.math import RigidTransform
 
 from vtbdrake.common.scan import Scan
+from vtbdrake.compiled import FixedPiece
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake_diagrams.space_climber import CraterScenario
 from vtbdrake_diagrams.space_climber.believed_scenario import believed_world, level_world
@@ -22,15 +23,17 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     HEADINGS,
     LEAST_GAIN,
     LOOKING,
+    CompiledRover,
     Explorer,
     Rover,
     Site,
     combined_friction,
+    compiled_world,
     least_slope,
     true_world,
 )
 from vtbdrake_diagrams.space_climber.survey import survey
-from vtbdrake_diagrams.space_climber.terrain import Crater
+from vtbdrake_diagrams.space_climber.terrain import Crater, crater_shapes
 
 
 def terrain(heights: np.ndarray) -> BelievedTerrain:
@@ -149,9 +152,43 @@ def test_a_robot_looks_tries_and_decides() -> None:
     # The floor is flat, and the survey's error of 0.3 m is not there where it has looked.
     assert after < min(before, 0.15)
     assert stop.said == ""
-    gains = dict(stop.tried)
+    gains = {heading: gain for heading, walk, gain in stop.tried if walk == 1.0}
     assert stop.heading == max(gains, key=gains.__getitem__)
     assert gains[stop.heading] > LEAST_GAIN
     rover.advance(12.0, heading=stop.heading, walk=1.0)
     way = rover.place
     assert np.arctan2(way[1], way[0]) == pytest.approx(stop.heading, abs=0.5)
+
+
+class DeadEnd(Site):
+    """A crater without boulders; across the way stand walls, open towards the robot, that the scanner does not see."""
+
+    WALLS = (
+        (Box(0.6, 2.4, 1.2), [6.0, 0.0, 0.0]),
+        (Box(0.6, 0.3, 1.2), [5.4, 1.05, 0.0]),
+        (Box(0.6, 0.3, 1.2), [5.4, -1.05, 0.0]),
+    )
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.world = replace(self.world, boulders=False, gullies=False, waviness=0.0)
+        self.terrain = BelievedTerrain(survey(self.world.crater, seed=0).ground, WorldModel())
+
+    def rover(self) -> CompiledRover:
+        pieces = [FixedPiece(shape, X_WS, 0.6) for _, shape, X_WS in crater_shapes(self.world.crater)]
+        pieces += [FixedPiece(box, RigidTransform(place), 0.6) for box, place in self.WALLS]
+        terrain = compiled_world()[1].terrain(pieces)
+        return CompiledRover(self.world, terrain, StandingScanner(self.world.crater), mass=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.one_python
+def test_a_robot_goes_back_from_a_dead_end_and_around_it() -> None:
+    """Straight on, it stays in there for good; nothing that it sees tells why."""
+    site = DeadEnd(2)
+    ahead = site.fixed(0.0)
+    # Its front feet are 0.4 m ahead of its middle, and the wall begins at 5.7 m.
+    assert 5.0 < ahead.end[0] < 5.7
+    assert not ahead.reached
+    walk = site.explore()
+    assert walk.reached
