@@ -88,6 +88,7 @@ class CarrierScenario(Scenario):
     map: str = setting("accurate", "The quality of the global map of the DPS, see `MAPS`.", choices=tuple(MAPS))
     map_seed: int = setting(0, "Determines the errors of the map.", ge=0)
     map_file: str = setting("", "A GeoJSON file to take the global map from instead; empty for none.")
+    revises_map: bool = setting(False, "Whether the DPS revises its map while it drives, see `Tracker`.")
     # The laser scanner, and the errors of its ranges in m.
     scanner: LaserScannerConfig = field(default_factory=scanner_config)
     scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
@@ -247,6 +248,7 @@ class CarrierScenario(Scenario):
             field_of_view=self.scanner.azimuth,
             scan_deviation=_LEVELLING * z,
             correlation=correlation,
+            revises=self.revises_map,
         )
         return LocalizationUnit(ConstellationMap(landmarks, correlation=correlation), tracker)
 

@@ -15,7 +15,7 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies import fusion
+from vtbdrake_diagrams.forest.studies import fusion, revised_maps
 from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     REACH,
@@ -118,7 +118,7 @@ def localization(full: bool) -> Answer:
     """Answer C2: how accurately does the unit localize itself?
 
     The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20. The unit with scanner and
-    cameras was driven before (`fusion`).
+    cameras (`fusion`) and the one that revises its map (`revised_maps`) were driven before.
     """
     drives = Drives(length=500.0 if full else 25.0)
     seeds = range(SEED, SEED + (20 if full else 4))
@@ -147,7 +147,9 @@ def localization(full: bool) -> Answer:
         f"error is {best.ratio:.2f} times as large ({best.interval[0]:.2f} to {best.interval[1]:.2f} with "
         f"95 % over forests; at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
         + ("the pose is the same. " if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}. ")
-        + _fused(fused),
+        + _fused(fused)
+        + " "
+        + revised_maps.in_words(revised_maps.load()),
     )
 
 

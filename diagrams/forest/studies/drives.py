@@ -36,7 +36,7 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
 from vtbdrake.components.localization.planar import wrap
-from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit, Views
+from vtbdrake.components.localization.unit import LOST, TRACKING, Localization, LocalizationUnit, UnitState, Views
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.perception import LandmarkSensor
@@ -165,12 +165,21 @@ class Track:
         return int(((self.status[:-1] != LOST) & (self.status[1:] == LOST)).sum())
 
 
+def memories(drive: Drive, unit: LocalizationUnit) -> Iterator[UnitState]:
+    """Yield the memory of a unit after each scan of a drive that begins without a guess."""
+    state = unit.start()
+    for landmarks, X_OH, time in zip(drive.landmarks, drive.reckoned, drive.times, strict=True):
+        _, state = unit.step(state, landmarks, X_OH=X_OH, time=float(time))
+        yield state
+
+
 def localize(drive: Drive, unit: LocalizationUnit) -> Track:
     """Return the answers of a unit along a drive that begins without a guess."""
-    state, answers = unit.start(), []
-    for landmarks, X_OH, time in zip(drive.landmarks, drive.reckoned, drive.times, strict=True):
-        answer, state = unit.step(state, landmarks, X_OH=X_OH, time=float(time))
-        answers.append(answer)
+    return track_of(drive, [state.answer for state in memories(drive, unit)])
+
+
+def track_of(drive: Drive, answers: Sequence[Localization]) -> Track:
+    """Return the answers to the scans of a drive, one each, as arrays."""
     return Track(
         drive,
         np.array([answer.pose for answer in answers]),
@@ -180,7 +189,13 @@ def localize(drive: Drive, unit: LocalizationUnit) -> Track:
 
 
 def simulated_drive(
-    stand: Stand, *, seed: int, length: float, detector: Detector | None = None, odometry: Odometry | None = None
+    stand: Stand,
+    *,
+    seed: int,
+    length: float,
+    detector: Detector | None = None,
+    odometry: Odometry | None = None,
+    scans: float = SCANS,
 ) -> Drive:
     """Return a drive at 1 m/s on a circle in the middle of a stand, with simulated detections.
 
@@ -190,6 +205,7 @@ def simulated_drive(
         length: The length of the drive in m.
         detector: The performance of the detector; by default `Detector`.
         odometry: The drift of the dead reckoning; by default `Odometry`.
+        scans: The number of scans per second.
     """
     detector, odometry = detector or Detector(), odometry or Odometry()
     rng = np.random.default_rng([seed, 8])
@@ -197,9 +213,9 @@ def simulated_drive(
     radius, angle = min(stand.length, stand.width) / 3.0, rng.uniform(-np.pi, np.pi)
     middle = 0.5 * np.array([stand.length, stand.width])
     begin = [*(middle + radius * np.array([np.cos(angle), np.sin(angle)])), angle + np.pi / 2.0]
-    truth = arc(begin, length=length, curvature=1.0 / radius, step=1.0 / SCANS)
+    truth = arc(begin, length=length, curvature=1.0 / radius, step=1.0 / scans)
     return Drive(
-        np.arange(len(truth)) / SCANS,
+        np.arange(len(truth)) / scans,
         truth,
         dead_reckoned(truth, odometry, rng),
         tuple(wood.detected(X_WH, detector, rng)[0] for X_WH in truth),

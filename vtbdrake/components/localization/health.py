@@ -1,8 +1,10 @@
 """The health of a track: whether the estimate of a `Tracker` may be used, or is lost.
 
-*Failures.* A scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
-last fused scan showed. Scans with few detections are judged together, as soon as they have enough. The track is lost
-after ``patience`` failures in succession, or when position or heading are too uncertain.
+*Failures.* A scan fails, and is not fused, if too few of its detections match the map, or too few of the landmarks that
+the last fused scan showed. If the map is revised, it may lack most of what is detected: then a scan whose detections
+do not match fails only if it shows too few of the map's landmarks in plain view, too. Scans with few detections are
+judged together, as soon as they have enough. The track is lost after ``patience`` failures in succession, or when
+position or heading are too uncertain.
 
 *Evidence.* The d² of a right first match is chi-square distributed, the d² of a match by chance is uniform within the
 gate γ of first matches. So the log-likelihood ratio of a match with d² is (a share ε = 0.2 of matches is by chance
@@ -32,6 +34,7 @@ place on the map, so that s² is too small rather than too large.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from vtbdrake.common.arrays import Array, Indices
@@ -43,6 +46,8 @@ from vtbdrake.components.localization.track_state import TrackState, in_level_fr
 _LEAST_SHARE = 0.15
 # A scan fails if it matches a smaller share of the landmarks that should be seen again.
 _LEAST_AGAIN = 0.25
+# A scan of a unit that revises its map does not fail if it matches this share of the map's landmarks in plain view.
+_LEAST_SHOWN = 0.3
 
 # Near the largest distance of detections, landmarks are not seen reliably: this share of it counts.
 _RELIABLE = 0.7
@@ -78,30 +83,48 @@ _TANGLED = 10.0
 _CHANCE = 0.2
 
 
-def judged(state: TrackState, view: SensorView, pairs: Indices) -> tuple[bool, Array]:
+def judged(
+    state: TrackState,
+    view: SensorView,
+    pairs: Indices,
+    *,
+    is_mapped: NDArray[np.bool_] | None = None,
+    shown: Indices | None = None,
+) -> tuple[bool, Array]:
     """Return whether a scan with these pairs of detection and landmark, (k, 2), fails, and what is still to be judged.
 
     Args:
         state: The state before the scan.
         view: The detections of the scan, in H.
         pairs: Indices of the detection and of the landmark on the map.
+        is_mapped: Whether the landmark of each pair is on the map, (k,); None if all are.
+        shown: Indices of the landmarks of the map in plain view; None if the map is not revised.
 
     Returns:
-        Whether it fails, and the counts for `TrackState.unjudged`, shape (2, 2).
+        Whether it fails, and the counts for `TrackState.unjudged`, shape (3, 2).
     """
-    matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
+    again = int(np.isin(pairs[:, 1], state.indices).sum())
     recent = in_level_frame(state, state.landmark_positions[state.is_recent])
     expected = int(view.is_in_view(recent, share=_RELIABLE).sum())
-    fails, unjudged = False, np.zeros((2, 2))
-    scan = np.array([[len(view.landmarks), matched], [expected, again]], dtype=float)
-    for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN)):
+    in_plain_view = np.zeros(0, dtype=np.intp) if shown is None else shown
+    scan = np.array(
+        [
+            [len(view.landmarks), len(pairs) if is_mapped is None else is_mapped.sum()],
+            [expected, again],
+            [len(in_plain_view), np.isin(in_plain_view, pairs[:, 1]).sum()],
+        ],
+        dtype=float,
+    )
+    fails, unjudged = [False, False, False], np.zeros((3, 2))
+    for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN, _LEAST_SHOWN)):
         # A scan with many is judged alone: those before it show another place.
         count, matches = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]
         if count < _JUDGED_FROM:
             unjudged[k] = count, matches
-        elif matches < least_share * count:
-            fails = True
-    return fails, unjudged
+        else:
+            fails[k] = matches < least_share * count
+    is_elsewhere = fails[0] and (shown is None or fails[2])
+    return is_elsewhere or fails[1], unjudged
 
 
 def evidence(squares: Array, first_gate: float) -> float:

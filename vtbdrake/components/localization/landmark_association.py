@@ -82,6 +82,12 @@ class ExpectedDetections:
     positions: Array
     covariance: Array
 
+    @property
+    def covariances(self) -> Array:
+        """The covariance of each expected detection in m², (m, 2, 2)."""
+        m = np.arange(len(self.indices))
+        return self.covariance[m, m]
+
 
 @dataclass(frozen=True, eq=False)
 class Association:
@@ -125,24 +131,44 @@ class Association:
         squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
         return self.usable[np.unique(near[squares <= gate * (spread[rows] + variances[near])])]
 
-    def matched(self, detections: Landmarks, expected: ExpectedDetections, *, field_of_view: float) -> MatchedPairs:
+    def within(self, place: Array, radius: float) -> Indices:
+        """Return the usable landmarks of the map within a radius of a place, (m,).
+
+        Args:
+            place: The place in W in m, (2,).
+            radius: The radius in m.
+        """
+        return self.usable[np.sort(np.asarray(self._tree.query_ball_point(place, radius), dtype=np.intp))]
+
+    def matched(
+        self,
+        detections: Landmarks,
+        expected: ExpectedDetections,
+        *,
+        field_of_view: float,
+        sizes: tuple[Array, Array] | None = None,
+    ) -> MatchedPairs:
         """Return the matches of detections, in H with their noise, with those that are expected.
 
         Args:
             detections: The detections of the scan, in H.
             expected: The detections that are expected of landmarks nearby.
             field_of_view: The horizontal field of view of the sensor in rad, for the density of detections.
+            sizes: The diameters of these landmarks and their standard deviations in m, (m,) each; None if all of them
+                are on the map.
         """
-        m = np.arange(len(expected.indices))
+        if sizes is None:
+            mapped = self.landmarks.select(expected.indices)
+            sizes = mapped.diameters, mapped.diameter_deviations
         innovations = detections.positions[:, None] - expected.positions
-        covariances = expected.covariance[m, m] + detections.covariances[:, None]
+        covariances = expected.covariances + detections.covariances[:, None]
         squares = squared_distances(innovations, covariances)
         threshold = chi_square_quantile(self.gate, 2)
         i, j = np.nonzero(squares < threshold)
         if not len(i):
             return MatchedPairs.none()
         agreeing, determinant = _agreeing(i, j, innovations[i, j], covariances[i, j], expected.covariance, threshold)
-        cost = agreeing + np.log(determinant) + self._diameter_cost(detections, i, expected.indices[j])
+        cost = agreeing + np.log(determinant) + self._diameter_cost(detections.select(i), sizes[0][j], sizes[1][j])
         gain = np.zeros(squares.shape)
         is_possible = agreeing < threshold
         gain[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
@@ -158,19 +184,19 @@ class Association:
         is_sure = (probability >= _LEAST_PROBABILITY) & (matches.squares < chi_square_quantile(self.first_gate, 2))
         return matches.select(is_sure | ~expected.is_first[columns])
 
-    def _diameter_cost(self, detections: Landmarks, rows: Indices, indices: Indices) -> Array:
+    def _diameter_cost(self, detections: Landmarks, diameters: Array, deviations: Array) -> Array:
         """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map.
 
         Args:
-            detections: The detections.
-            rows: The detections of the pairs, (k,).
-            indices: The landmarks of the pairs, (k,).
+            detections: The detection of each pair, k of them.
+            diameters: The diameters of the landmarks of the pairs in m, (k,).
+            deviations: The standard deviations of these in m, (k,).
         """
-        mapped, measured = self.landmarks.diameters, detections.diameters[rows]
-        noise = np.minimum(detections.diameter_deviations[rows], _NO_DIAMETER) ** 2
-        right = np.minimum(self.landmarks.diameter_deviations[indices], _NO_DIAMETER) ** 2 + noise
+        mapped, measured = self.landmarks.diameters, detections.diameters
+        noise = np.minimum(detections.diameter_deviations, _NO_DIAMETER) ** 2
+        right = np.minimum(deviations, _NO_DIAMETER) ** 2 + noise
         any_other = mapped.var() + noise
-        ratio = (measured - mapped[indices]) ** 2 / right + np.log(right / any_other)
+        ratio = (measured - diameters) ** 2 / right + np.log(right / any_other)
         # A diameter that is known no better than all diameters together carries no information.
         cost = np.where(right < any_other, ratio - (measured - mapped.mean()) ** 2 / any_other, 0.0)
         return np.minimum(cost, _DIAMETER_CAP)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array, Indices, immutable
 from vtbdrake.components.localization.planar import rotation
+from vtbdrake.components.localization.revision import Revision
 
 BIAS = 3
 """The place of b in x."""
@@ -31,7 +32,8 @@ class TrackState:
     Attributes:
         mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
         covariance: The covariance of x, shape (6 + 2 n, 6 + 2 n).
-        indices: Indices on the map of the landmarks in x, shape (n,).
+        indices: Indices on the map of the landmarks in x, shape (n,); those that the map lacks are numbered from its
+            size on.
         is_recent: Whether each of them was seen in the last scan that was fused and had it in view, shape (n,).
         evidence: Cumulative log-likelihood ratio of first matches.
         failures: The number of scans in succession that failed.
@@ -39,9 +41,11 @@ class TrackState:
         scatter: The factor by which the variance of the map's errors seems larger than the map says, at least 1.
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
         unjudged: Numbers of detections and of matched ones, of landmarks that should be seen again and of seen ones,
-            in the last scans, which together had too few to be judged, shape (2, 2).
+            of the map's landmarks in plain view and of matched ones, in the last scans, which together had too few to
+            be judged, shape (3, 2).
         travelled: The distance travelled by dead reckoning since the start of the track, in m.
         seen_at: That distance at the last fused detection of each landmark in x, shape (n,) in m; -inf before.
+        revision: What the drive has shown of the landmarks, if the map is revised.
 
     From ``evidence`` to ``unjudged``, they are the health of the track, see `vtbdrake.components.localization.health`.
     """
@@ -55,9 +59,10 @@ class TrackState:
     distortion: float = 0.0
     scatter: float = 1.0
     drift: float = 1.0
-    unjudged: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    unjudged: Array = field(default_factory=lambda: np.zeros((3, 2)))
     travelled: float = 0.0
     seen_at: Array = field(default_factory=lambda: np.zeros(0))
+    revision: Revision = field(default_factory=Revision.none)
 
     @classmethod
     def none(cls) -> TrackState:

@@ -44,6 +44,17 @@ and in the test of the innovation. Who stands still learns nothing from further 
 
 A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees.
 
+If the map is revised (``revises``), a detection that can show no landmark of the map and none of the state begins a
+landmark that the map lacks. With the pose, the bias and the noise of the detection it has the position
+
+    l = p_WoHo_W + R_WH (z - b (z - s) / |z - s|),
+
+and is correlated with the pose and with all other landmarks accordingly. From then on it is tracked as the others are.
+So the uncertainty of the pose grows where there are no landmarks of the map, and landmarks that were begun there are
+corrected when the pose is, by landmarks that are seen again. (The farther landmarks are not left to a graph of poses:
+the filter has their covariances at hand, which the association needs in each scan.) Landmarks that are gone are
+dropped; see `vtbdrake.components.localization.revision`.
+
 `vtbdrake.components.localization.landmark_association` decides which landmark each detection shows,
 `vtbdrake.components.localization.health` whether the estimate may be used.
 """
@@ -54,16 +65,17 @@ from dataclasses import dataclass, field, replace
 from math import inf, pi, sin
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.common.settings import check_settings, setting
-from vtbdrake.components.estimation import chi_square_quantile
+from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization import health
 from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import compose, rotation
+from vtbdrake.components.localization.revision import MapChanges, is_in_plain_view
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState, in_level_frame
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
@@ -72,13 +84,20 @@ _OBSERVED = 4
 # Standard deviations in m and rad of a pose without information.
 _LOOSE = np.array([5.0, 5.0, 0.2])
 
+# What lies within this share of right pairs around a landmark may be the landmark: it does not show that the landmark
+# is gone, and is no other one.
+_WIDE_GATE = 0.9999
+# The gap between the barks of two trunks in m below which a detector does not separate them.
+_LEAST_GAP = 0.3
+
 
 @dataclass(frozen=True, eq=False)
 class Matches:
     """The matches of a scan with the map.
 
     Attributes:
-        pairs: Indices of the detection and of the landmark on the map, shape (k, 2).
+        pairs: Indices of the detection and of the landmark on the map, shape (k, 2); landmarks that the map lacks are
+            numbered from its size on.
         nis: The normalized innovation squared of the pairs: chi-square distributed with 2 k degrees of freedom.
         is_fused: Whether the scan changed the estimate.
     """
@@ -193,6 +212,17 @@ class Tracker:
     lasting_length: float = setting(
         8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
     )
+    revises: bool = setting(
+        False, "Whether landmarks that the map lacks are added, and landmarks that are gone are dropped."
+    )
+    lasting_deviation: float = setting(
+        0.018,
+        "Standard deviation, per axis, of the error that all detections of a landmark have in common, as by bark and "
+        "lean. It is in the covariances of added landmarks; their detections are fused as independent. Calibrated with "
+        "simulated scans of `vtbdrake_diagrams.forest`, whose trunks lean by 0.01 rad.",
+        unit="m",
+        ge=0.0,
+    )
     _association: Association = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -277,28 +307,29 @@ class Tracker:
             return state, _NO_MATCHES
         matches = self._associate(state, view)
         failed = replace(
-            state.with_arrays(unjudged=np.zeros((2, 2))),
+            state.with_arrays(unjudged=np.zeros((3, 2))),
             failures=state.failures + 1,
             drift=health.drift_after_failure(state),
         )
-        fails, unjudged = health.judged(state, view, matches.pairs)
+        fails, unjudged = self._judged(state, view, matches.pairs)
         if fails:
             return failed, Matches(matches.pairs)
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
         # A first match alone has nothing that agrees with it; one of a landmark in the state does not need it.
         if len(matches.pairs) < 2 and (is_first.all() or not len(matches.pairs)):
-            return state.with_arrays(unjudged=unjudged), Matches(matches.pairs)
+            return self._revised(state.with_arrays(unjudged=unjudged), view, matches.pairs), Matches(matches.pairs)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
         fused, remaining = self._fused(extended, view, np.vstack([matches.pairs[~is_first], first.pairs]))
         # Too few of the pairs may be left.
-        fails, unjudged = health.judged(state, view, remaining.pairs)
+        fails, unjudged = self._judged(state, view, remaining.pairs)
         if fails:
             return failed, Matches(remaining.pairs)
         evidence = min(self.credit, state.evidence + health.evidence(first.squares, self.first_gate))
         drift = health.drift_after(state, fused) if remaining.is_fused else state.drift
         fused = fused.with_arrays(unjudged=unjudged)
-        return replace(fused, evidence=evidence, failures=0, drift=drift), remaining
+        fused = replace(fused, evidence=evidence, failures=0, drift=drift)
+        return self._revised(fused, view, remaining.pairs) if remaining.is_fused else fused, remaining
 
     def is_lost(self, state: TrackState) -> bool:
         """Return whether the track is lost, so that its pose must not be used any more."""
@@ -316,6 +347,32 @@ class Tracker:
     def pose_covariance(self, state: TrackState) -> Array:
         """Return the covariance of X_WH, (3, 3), larger than the filter's if the map seems distorted."""
         return state.pose_covariance * health.widening(state)
+
+    def changes(self, state: TrackState) -> MapChanges:
+        """Return the differences of the map from what the drive has shown so far; none if it is not revised.
+
+        A landmark that the map lacks may be one whose error on the map is too large for a match. If one of the same
+        diameter that is not matched is that near, the two are taken for the same: it is moved, not added.
+        """
+        is_added = ~self._is_mapped(state.indices) & np.isin(state.indices, state.revision.sure)
+        rows = np.flatnonzero(is_added)
+        places = state.landmark_positions[rows]
+        covariances = np.array([state.covariance[np.ix_(columns, columns)] for columns in _columns(rows)])
+        diameters, deviations = self._sizes(state, state.indices[rows])
+        covariances = covariances.reshape(-1, 2, 2) + self.lasting_deviation**2 * np.eye(2)
+        landmarks = Landmarks(places, covariances, diameters, deviations)
+        unmatched = np.setdiff1d(self._association.usable, state.indices)
+        on_map = self.landmarks.select(unmatched)
+        squares = squared_distances(
+            places[:, None] - on_map.positions, landmarks.covariances[:, None] + on_map.covariances
+        )
+        variances = landmarks.diameter_deviations[:, None] ** 2 + on_map.diameter_deviations**2
+        squares += (landmarks.diameters[:, None] - on_map.diameters) ** 2 / np.maximum(variances, 1e-6)
+        moved, origins = one_to_one(chi_square_quantile(_WIDE_GATE, 3) - squares)
+        added = landmarks.select(np.setdiff1d(np.arange(len(landmarks)), moved))
+        gone = state.revision.gone
+        gone = np.setdiff1d(gone[self._is_mapped(gone)], unmatched[origins])
+        return MapChanges(added, gone, landmarks.select(moved), unmatched[origins])
 
     def _widened(self, landmarks: Landmarks | SensorView) -> SensorView:
         view = SensorView.of(landmarks)
@@ -341,14 +398,18 @@ class Tracker:
             prior = block_diag(np.zeros((0, 0)), *((state.scatter * factor)[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
         else:
-            M = self._map_errors(np.concatenate([state.indices, indices]))
-            weights = np.linalg.solve(M[:n, :n], M[:n, n:])
-            rest = M[n:, n:] - M[n:, :n] @ weights
+            is_mapped = self._is_mapped(state.indices)
+            mapped = state.indices[is_mapped]
+            k = len(mapped)
+            M = self._map_errors(np.concatenate([mapped, indices]))
+            weights = np.linalg.solve(M[:k, :k], M[:k, k:])
+            rest = M[k:, k:] - M[k:, :k] @ weights
             if probability is not None:
                 # The variance of the error of each landmark, given the errors of all others, times the factor.
-                rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(M))[n:])
-            prior, J = np.kron(state.scatter * rest, np.eye(2)), np.kron(weights.T, np.eye(2))
-            added = places[indices] + weights.T @ (state.landmark_positions - places[state.indices])
+                rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(M))[k:])
+            prior, J = np.kron(state.scatter * rest, np.eye(2)), np.zeros((2 * m, 2 * n))
+            J[:, np.repeat(is_mapped, 2)] = np.kron(weights.T, np.eye(2))
+            added = places[indices] + weights.T @ (state.landmark_positions[is_mapped] - places[mapped])
         cross = J @ P[FIXED:]
         return state.with_arrays(
             mean=np.concatenate([mean, added.ravel()]),
@@ -375,18 +436,27 @@ class Tracker:
         """Return the matches of detections with the map around the pose of a state."""
         detections = view.landmarks
         near = self._association.nearby(state.pose, state.pose_covariance, detections, scatter=state.scatter)
+        if self.revises:
+            is_near = np.isin(state.indices, self._around(state, view)) & ~self._is_mapped(state.indices)
+            near = np.union1d(np.setdiff1d(near, state.revision.gone), state.indices[is_near])
         if not len(near):
             return MatchedPairs.none()
-        extended = self._extended(state, near[~np.isin(near, state.indices)])
-        rows = np.flatnonzero(np.isin(extended.indices, near))
+        expected = self._expected_of(state, near, view)
+        return self._association.matched(
+            detections,
+            expected,
+            field_of_view=min(self.field_of_view, view.field_of_view),
+            sizes=self._sizes(state, expected.indices),
+        )
+
+    def _expected_of(self, state: TrackState, identities: Indices, view: SensorView) -> ExpectedDetections:
+        """Return the detections that are expected of landmarks, (m,), also of some that the state does not have yet."""
+        extended = self._extended(state, identities[~np.isin(identities, state.indices)])
+        rows = np.flatnonzero(np.isin(extended.indices, identities))
         positions, H = self._expected(extended, rows, is_scan=view.is_scan)
         HPHt = _times(H, rows, _times_transpose(extended.covariance, H, rows))
         covariance = HPHt.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
-        is_first = rows >= len(state.indices)
-        expected = ExpectedDetections(extended.indices[rows], is_first, positions, covariance)
-        return self._association.matched(
-            detections, expected, field_of_view=min(self.field_of_view, view.field_of_view)
-        )
+        return ExpectedDetections(extended.indices[rows], rows >= len(state.indices), positions, covariance)
 
     def _fused(self, state: TrackState, view: SensorView, pairs: Indices) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
@@ -424,9 +494,13 @@ class Tracker:
         far = distance > self.horizon
         far[np.argsort(distance)[self.most :]] = True
         near = fused.without(far)
-        places = self.landmarks.positions[near.indices]
-        M = self._map_errors(near.indices)
-        distortion, scatter = health.distortion(places, near.landmark_positions - places, M)
+        is_mapped = self._is_mapped(near.indices)
+        mapped = near.indices[is_mapped]
+        if not len(mapped):
+            return near, Matches(pairs, nis, is_fused=True)
+        places = self.landmarks.positions[mapped]
+        M = self._map_errors(mapped)
+        distortion, scatter = health.distortion(places, near.landmark_positions[is_mapped] - places, M)
         return replace(near, distortion=distortion, scatter=scatter), Matches(pairs, nis, is_fused=True)
 
     def _repeated(self, state: TrackState, rows: Indices) -> Array:
@@ -441,6 +515,91 @@ class Tracker:
         way = (state.travelled - state.seen_at[rows]) / self.lasting_length
         rho = np.exp(-np.maximum(way, 1e-6))
         return 2.0 * self.lasting_share * rho / (1.0 - rho)
+
+    def _is_mapped(self, identities: Indices) -> NDArray[np.bool_]:
+        """Return whether landmarks are on the map, not only in the state, (m,)."""
+        is_mapped: NDArray[np.bool_] = identities < len(self.landmarks)
+        return is_mapped
+
+    def _sizes(self, state: TrackState, identities: Indices) -> tuple[Array, Array]:
+        """Return the diameters of landmarks and their standard deviations in m, (m,) each."""
+        is_mapped = self._is_mapped(identities)
+        mapped, rows = identities[is_mapped], state.revision.rows(identities[~is_mapped])
+        sizes = np.empty((2, len(identities)))
+        sizes[:, is_mapped] = self.landmarks.diameters[mapped], self.landmarks.diameter_deviations[mapped]
+        sizes[:, ~is_mapped] = state.revision.diameters[rows], state.revision.diameter_deviations[rows]
+        return sizes[0], sizes[1]
+
+    def _around(self, state: TrackState, view: SensorView) -> Indices:
+        """Return the landmarks that are not gone, and as near as the detections of a view, (m,)."""
+        radius = float(np.hypot(*view.landmarks.positions.T).max()) + self.largest_deviation
+        mapped = self._association.within(state.pose[:2], radius)
+        is_near = np.hypot(*(state.landmark_positions - state.pose[:2]).T) < radius
+        return np.union1d(np.setdiff1d(mapped, state.revision.gone), state.indices[is_near])
+
+    def _judged(self, state: TrackState, view: SensorView, pairs: Indices) -> tuple[bool, Array]:
+        """Return whether a scan with these pairs fails, and what is still to be judged, see `health.judged`."""
+        shown = None
+        if self.revises:
+            around = self._around(state, view)
+            mapped = around[self._is_mapped(around)]
+            places = in_level_frame(state, self.landmarks.positions[mapped])
+            shown = mapped[is_in_plain_view(view, places, self.landmarks.diameters[mapped])]
+        return health.judged(state, view, pairs, is_mapped=self._is_mapped(pairs[:, 1]), shown=shown)
+
+    def _revised(self, state: TrackState, view: SensorView, pairs: Indices) -> TrackState:
+        """Return the state with what a scan shows of the landmarks around, after the fusion of its matches (k, 2)."""
+        if not self.revises:
+            return state
+        expected = self._expected_of(state, self._around(state, view), view)
+        left = np.setdiff1d(np.arange(len(view.landmarks)), pairs[:, 0])
+        rest = view.landmarks.select(left)
+        offsets = rest.positions[:, None] - expected.positions
+        squares = squared_distances(offsets, expected.covariances + rest.covariances[:, None])
+        wide = chi_square_quantile(_WIDE_GATE, 2)
+        is_hit = np.isin(expected.indices, pairs[:, 1])
+        diameters, _ = self._sizes(state, expected.indices)
+        is_shown = is_in_plain_view(view, expected.positions, diameters)
+        is_judged = is_hit | (is_shown & (squares > wide).all(axis=0))
+        judged = expected.indices[is_judged]
+        unknown = np.setdiff1d(judged, state.revision.identities)
+        matched = view.landmarks.select(pairs[_rows_of(pairs[:, 1], expected.indices[is_hit]), 0])
+        revision = state.revision.with_landmarks(unknown, self.landmarks.select(unknown))
+        revision = revision.judged(judged, is_hit[is_judged], state.pose[:2], matched)
+        # What lies in the gate of a landmark that was not matched yet may be matched to it later.
+        gates = np.where(expected.is_first, chi_square_quantile(self.first_gate, 2), wide)
+        gaps = np.hypot(*offsets.transpose(2, 0, 1)) - 0.5 * (rest.diameters[:, None] + diameters)
+        is_new = ((squares > gates) & (expected.is_first | (gaps > _LEAST_GAP))).all(axis=1)
+        remaining = state.without(np.isin(state.indices, revision.gone))
+        begun = self._begun(replace(remaining, revision=revision), view, left[is_new])
+        is_kept = self._is_mapped(begun.revision.identities) | np.isin(begun.revision.identities, begun.indices)
+        return replace(begun, revision=begun.revision.select(is_kept))
+
+    def _begun(self, state: TrackState, view: SensorView, rows: Indices) -> TrackState:
+        """Return the state with landmarks that the map lacks, by their first detections, the given ones of a view."""
+        detections, m, P, R_WH = view.landmarks.select(rows), len(rows), state.covariance, rotation(state.mean[2])
+        ray = detections.positions - np.asarray(self.sensor)
+        along = float(view.is_scan) * ray / np.maximum(np.hypot(*ray.T), 1e-3)[:, None]
+        from_carrier = (detections.positions - state.mean[BIAS] * along) @ R_WH.T
+        # The derivatives of the positions with respect to the pose and the bias.
+        derivatives = np.empty((m, 2, _OBSERVED))
+        derivatives[:, :, :2] = np.eye(2)
+        derivatives[:, :, 2] = from_carrier[:, ::-1] * [-1.0, 1.0]
+        derivatives[:, :, BIAS] = -along @ R_WH.T
+        A = derivatives.reshape(2 * m, _OBSERVED)
+        noise = block_diag(np.zeros((0, 0)), *(R_WH @ detections.covariances @ R_WH.T))
+        noise += self.scan_deviation**2 * np.tile(np.eye(2), (m, m))
+        cross = A @ P[:_OBSERVED]
+        identities = len(self.landmarks) + state.revision.begun + np.arange(m)
+        revision = state.revision.with_landmarks(identities, detections, begun_at=state.pose[:2])
+        begun = state.with_arrays(
+            mean=np.concatenate([state.mean, (state.mean[:2] + from_carrier).ravel()]),
+            covariance=np.block([[P, cross.T], [cross, cross[:, :_OBSERVED] @ A.T + noise]]),
+            indices=np.concatenate([state.indices, identities]),
+            is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
+            seen_at=np.concatenate([state.seen_at, np.full(m, state.travelled)]),
+        )
+        return replace(begun, revision=revision)
 
     def _expected(self, state: TrackState, rows: Indices, *, is_scan: bool) -> tuple[Array, Array]:
         """Return the expected detections of landmarks of the state in H, (m, 2), and the derivatives (m, 2, 6).
