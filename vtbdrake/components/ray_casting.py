@@ -271,7 +271,7 @@ def _mesh(shape: Any, name: str) -> Surface:
         return _read(source.path(), shape.scale3())
     contents = source.in_memory().mesh_file.contents()
     is_mirrored = (shape.scale3() < 0.0).any()  # Then Drake turns the triangles around.
-    if not is_mirrored and (surface := _triangles_alone(contents.decode())):
+    if not is_mirrored and (surface := _triangles_alone(contents.decode(errors="replace"))):
         return surface[0] * shape.scale3(), surface[1]
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.obj"
