@@ -84,7 +84,7 @@ class _Best:
 
     @property
     def is_there(self) -> bool:
-        """Whether the solver may stop."""
+        """Return whether the solver may stop."""
         return self.deviation <= _HELD if self._move.space.wheels else self.cost <= _cost(self._target)
 
     def look(self, z: Array, cost: float, g: Array) -> None:

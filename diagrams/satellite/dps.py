@@ -66,7 +66,7 @@ class TargetSensors:
 
 @dataclass(frozen=True)
 class ApproachConfig:
-    """How the arm's approach is planned.
+    """The settings of the planned approach of the arm.
 
     Attributes:
         duration: The duration of the move, in s.

@@ -68,14 +68,14 @@ class Reason(IntEnum):
 
 
 class Arrival(IntEnum):
-    """How the arm comes before the bar in the mode approach; the variable ``arrival`` holds the numbers."""
+    """The ways in which the arm comes before the bar in the mode approach, as the variable ``arrival`` has them."""
 
     RATES = 0
-    """By resolved rate, from the start."""
+    """Resolved rate leads the arm from the start."""
     PLANNING = 1
     """A plan has been asked for; the arm waits for it."""
     PLANNED = 2
-    """Along the plan."""
+    """The arm follows the plan."""
     ARRIVED = 3
     """The plan has ended; resolved rate goes on."""
     REFUSED = 4

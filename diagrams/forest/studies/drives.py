@@ -569,6 +569,7 @@ def plain(seed: int, *, range_bias: float = 0.0) -> PlainScenario:
 
 
 _Carrier = TypeVar("_Carrier", bound=CarrierScenario)
+_Result = TypeVar("_Result")
 
 
 def _begun(scenario: _Carrier, rng: np.random.Generator) -> _Carrier:
@@ -615,8 +616,15 @@ class Drives:
 
     def through(self, seeds: Sequence[int], *, workers: int = 2) -> Iterator[dict[str, Track]]:
         """Drive through the forests of some seeds in processes, and yield the tracks by map in the order of seeds."""
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            yield from pool.map(self, seeds)
+        yield from (tracks for _, tracks in in_processes(self, seeds, workers=workers))
+
+
+def in_processes(
+    function: Callable[[int], _Result], seeds: Sequence[int], *, workers: int
+) -> Iterator[tuple[int, _Result]]:
+    """Yield each seed with the function's result for it, in the order of the seeds; it runs in processes."""
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from zip(seeds, pool.map(function, seeds), strict=True)
 
 
 def scores(tracks_of_drives: Sequence[Mapping[str, Track]]) -> dict[str, Score]:

@@ -17,12 +17,10 @@ its pose where it is hard errs less in the mean. A first campaign, from seed 700
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from math import nan
-from multiprocessing import get_context
 from pathlib import Path
 
 import click
@@ -33,7 +31,7 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive, rms
+from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, in_processes, localize, recorded_drive, rms
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import read_results, write_results
 
@@ -284,11 +282,10 @@ def main(forests: int, workers: int) -> None:
     """Drive through the forests that the file lacks, and print the table of all."""
     results = load() if FILE.exists() else {}
     seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for seed, errors in zip(seeds, pool.map(compared, seeds), strict=True):
-            results[seed] = errors
-            write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.fusion")
-            print(f"{len(results)} forests", flush=True)
+    for seed, errors in in_processes(compared, seeds, workers=workers):
+        results[seed] = errors
+        write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.fusion")
+        print(f"{len(results)} forests", flush=True)
     print(report(results))
 
 

@@ -25,9 +25,7 @@ dead reckoning, and back in it the landmarks from outside must be nearer to the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import click
@@ -42,6 +40,7 @@ from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse
+from vtbdrake.components.localization.track_state import landmark_columns
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import LocalizationUnit, UnitState
 from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
@@ -50,6 +49,7 @@ from vtbdrake_diagrams.forest.studies.drives import (
     Drive,
     Track,
     forest,
+    in_processes,
     memories,
     nees_bounds,
     recorded_drive,
@@ -269,7 +269,7 @@ def joint_nees(state: UnitState, rows: Indices, places: Array, *, lasting: float
         return 0.0, 0
     track = state.track
     errors = (track.landmark_positions[rows] - places).ravel()
-    columns = (len(track.mean) - 2 * len(track.indices) + 2 * rows[:, None] + np.arange(2)).ravel()
+    columns = landmark_columns(rows).ravel()
     P = track.covariance[np.ix_(columns, columns)] + lasting**2 * np.eye(len(columns))
     return float(errors @ np.linalg.solve(P, errors)), len(errors)
 
@@ -616,11 +616,10 @@ def main(scanned: int, workers: int) -> None:
     for kind, by_seed in results.items():
         count = scanned if kind == "out of date, scanner" else FORESTS
         seeds = [seed for seed in range(SEED, SEED + count) if seed not in by_seed]
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            for seed, cases in zip(seeds, pool.map(Driven(kind), seeds), strict=True):
-                by_seed[seed] = cases
-                write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.revised_maps")
-                print(f"{kind}: {len(by_seed)} forests", flush=True)
+        for seed, cases in in_processes(Driven(kind), seeds, workers=workers):
+            by_seed[seed] = cases
+            write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.revised_maps")
+            print(f"{kind}: {len(by_seed)} forests", flush=True)
     print(report(results))
 
 

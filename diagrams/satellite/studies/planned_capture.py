@@ -45,7 +45,7 @@ COMMAND = "python -m vtbdrake_diagrams.satellite.studies.planned_capture --count
 FIRST_SEED = 5000
 """The seed of the first start."""
 HORIZON = 75.0
-"""How long a capture may take, in s: the supervisor gives up after 60 s."""
+"""The time that a capture may take, in s: the supervisor gives up after 60 s."""
 SAMPLE_PERIOD = 0.2
 """Sample period of all readings, in s."""
 CONFIDENCE = 0.9
@@ -60,7 +60,7 @@ _JOINTS = [f"sim.sys.servicer.{name}.position" for name in ARM_JOINT_NAMES]
 
 @dataclass(frozen=True)
 class Capture:
-    """What became of a capture.
+    """The outcome of a capture.
 
     Attributes:
         seed: Its start.

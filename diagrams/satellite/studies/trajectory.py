@@ -38,7 +38,7 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import (
     free_knots,
     limits,
 )
-from vtbdrake_diagrams.satellite.studies.planned_capture import PlannedCaptures, kept_captures
+from vtbdrake_diagrams.satellite.studies.planned_capture import PlannedCaptures, kept_captures, median
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -275,10 +275,8 @@ class Survey:
     @cached_property
     def interval(self) -> tuple[float, float]:
         """Return the 90 % interval of the median factor, by order statistics."""
-        from scipy.stats import quantile_test  # It takes longer to load than all the rest.
-
-        lower, upper = quantile_test(self.factors, q=_FACTOR, p=0.5).confidence_interval(0.9)
-        return float(lower), float(upper)
+        _, lower, upper = median(self.factors)
+        return lower, upper
 
     @property
     def disturbance(self) -> dict[str, float]:

@@ -95,8 +95,7 @@ class Revision:
 
     def rows(self, identities: Indices) -> Indices:
         """Return the rows of landmarks that are in the revision, (m,)."""
-        order = np.argsort(self.identities)
-        return order[np.searchsorted(self.identities, identities, sorter=order)]
+        return places_of(self.identities, identities)
 
     def select(self, mask: NDArray[np.bool_]) -> Revision:
         """Return the revision with the landmarks for which the mask (k,) is true."""
@@ -170,6 +169,17 @@ class MapChanges:
     gone: Indices
     moved: Landmarks
     origins: Indices
+
+
+def places_of(identities: Indices, searched: Indices) -> Indices:
+    """Return the places of landmarks among others, (m,).
+
+    Args:
+        identities: The identities of the others, each once, (k,).
+        searched: The identities of the landmarks, (m,); each is one of these.
+    """
+    order = np.argsort(identities)
+    return order[np.searchsorted(identities, searched, sorter=order)]
 
 
 def is_in_plain_view(view: SensorView, positions: Array, diameters: Array) -> NDArray[np.bool_]:

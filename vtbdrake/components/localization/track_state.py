@@ -122,3 +122,8 @@ def in_level_frame(state: TrackState, places: Array) -> Array:
         places: The places in W, (n, 2).
     """
     return (places - state.mean[:2]) @ rotation(-state.mean[2]).T
+
+
+def landmark_columns(rows: Indices) -> Indices:
+    """Return the places in x of landmarks, rows of the state, shape (m, 2)."""
+    return FIXED + 2 * rows[:, None] + np.arange(2)

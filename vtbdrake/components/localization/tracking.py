@@ -75,8 +75,16 @@ from vtbdrake.components.localization import health
 from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.planar import compose, rotation
-from vtbdrake.components.localization.revision import MapChanges, is_in_plain_view
-from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState, in_level_frame
+from vtbdrake.components.localization.revision import MapChanges, is_in_plain_view, places_of
+from vtbdrake.components.localization.track_state import (
+    BIAS,
+    FIXED,
+    ODOMETRY,
+    RATE,
+    TrackState,
+    in_level_frame,
+    landmark_columns,
+)
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
 _OBSERVED = 4
@@ -357,7 +365,7 @@ class Tracker:
         is_added = ~self._is_mapped(state.indices) & np.isin(state.indices, state.revision.sure)
         rows = np.flatnonzero(is_added)
         places = state.landmark_positions[rows]
-        covariances = np.array([state.covariance[np.ix_(columns, columns)] for columns in _columns(rows)])
+        covariances = np.array([state.covariance[np.ix_(columns, columns)] for columns in landmark_columns(rows)])
         diameters, deviations = self._sizes(state, state.indices[rows])
         covariances = covariances.reshape(-1, 2, 2) + self.lasting_deviation**2 * np.eye(2)
         landmarks = Landmarks(places, covariances, diameters, deviations)
@@ -463,7 +471,7 @@ class Tracker:
         detections = view.landmarks
         # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
         while len(pairs):
-            rows = _rows_of(state.indices, pairs[:, 1])
+            rows = places_of(state.indices, pairs[:, 1])
             expected, H = self._expected(state, rows, is_scan=view.is_scan)
             nu = (detections.positions[pairs[:, 0]] - expected).ravel()
             PHt = _times_transpose(state.covariance, H, rows)
@@ -563,7 +571,7 @@ class Tracker:
         is_judged = is_hit | (is_shown & (squares > wide).all(axis=0))
         judged = expected.indices[is_judged]
         unknown = np.setdiff1d(judged, state.revision.identities)
-        matched = view.landmarks.select(pairs[_rows_of(pairs[:, 1], expected.indices[is_hit]), 0])
+        matched = view.landmarks.select(pairs[places_of(pairs[:, 1], expected.indices[is_hit]), 0])
         revision = state.revision.with_landmarks(unknown, self.landmarks.select(unknown))
         revision = revision.judged(judged, is_hit[is_judged], state.pose[:2], matched)
         # What lies in the gate of a landmark that was not matched yet may be matched to it later.
@@ -647,20 +655,9 @@ def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
     return corrected, P + np.outer(P[:, 2], lever)
 
 
-def _rows_of(indices: Indices, values: Indices) -> Indices:
-    """Return the positions of the values in indices, which have each value once."""
-    order = np.argsort(indices)
-    return order[np.searchsorted(indices, values, sorter=order)]
-
-
-def _columns(rows: Indices) -> Indices:
-    """Return the places in x of landmarks, shape (m, 2)."""
-    return FIXED + 2 * rows[:, None] + np.arange(2)
-
-
 def _times_transpose(P: Array, H: Array, rows: Indices) -> Array:
     """Return P Hᵀ, shape (N, 2 m), for derivatives (m, 2, 6)."""
-    by_landmark = np.einsum("Nmj,mij->Nmi", P[:, _columns(rows)], H[:, :, _OBSERVED:])
+    by_landmark = np.einsum("Nmj,mij->Nmi", P[:, landmark_columns(rows)], H[:, :, _OBSERVED:])
     return P[:, :_OBSERVED] @ H[:, :, :_OBSERVED].reshape(-1, _OBSERVED).T + by_landmark.reshape(len(P), -1)
 
 
