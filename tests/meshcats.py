@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+
+from vtbdrake.drake_workarounds.kept_meshcats import is_running
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
 
 PATIENCE = 60.0  # s
 
@@ -16,7 +23,10 @@ MALFORMED = b"\x81\xa4typ"
 
 
 def kill(url: str, message: bytes = b"") -> None:
-    """Send a message that a Meshcat cannot read, from a page of another origin, and wait until its thread is gone."""
+    """Send a message that a Meshcat cannot read, from a page of another origin, and wait until it closes.
+
+    Its thread has ended some time after that, and later still where the computer is busy: see `kill_own`.
+    """
     address = url.replace("http", "ws", 1)
     with connect(address, origin="http://evil.example", proxy=None, open_timeout=PATIENCE) as socket:  # type: ignore[arg-type]
         socket.send(message)
@@ -25,6 +35,15 @@ def kill(url: str, message: bytes = b"") -> None:
                 socket.recv(PATIENCE)
         except ConnectionClosed:
             return
+
+
+def kill_own(meshcat: Meshcat) -> None:
+    """Kill a Meshcat of this thread, and wait until its own thread has ended, so that each of its methods raises."""
+    kill(meshcat.web_url())
+    limit = time.monotonic() + PATIENCE
+    while is_running(meshcat):
+        assert time.monotonic() < limit
+        time.sleep(0.005)  # Leave the processor to the thread that ends.
 
 
 def listening(process: int) -> list[str]:

@@ -62,17 +62,18 @@ def test_garbage_collector_of_another_thread_ends_no_meshcat(way):
 
 
 DEATH = """
-from tests.meshcats import kill
+from tests.meshcats import kill, kill_own
 from tests.testbeds import PendulumScenario
 from vtbdrake.visualization import make_meshcat
 
 meshcat = make_meshcat()
-kill(meshcat.web_url())
 """
 ENDS = {
-    "at the end of the process": "",
-    "with the next one": "del meshcat; make_meshcat()",
+    # While it dies, or after that.
+    "at the end of the process": "kill(meshcat.web_url())",
+    "with the next one": "kill(meshcat.web_url()); del meshcat; make_meshcat()",
     "after a simulation that drew into it": """
+kill_own(meshcat)
 try:
     testbed = PendulumScenario().build(meshcat=meshcat)
     testbed.simulator(testbed.default_context()).Initialize()

@@ -230,10 +230,10 @@ def poses_are_those_before_a_fixed_step() -> bool:
 TWO_MESHCATS = """
 import threading
 from pydrake.geometry import Meshcat
-from tests.meshcats import kill
+from tests.meshcats import kill_own
 
 killed, other = [Meshcat()], [Meshcat()]
-kill(killed[0].web_url())
+kill_own(killed[0])
 try:
     killed[0].port()
 except RuntimeError as error:
