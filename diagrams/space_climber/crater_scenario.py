@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import casadi
 import numpy as np
@@ -27,6 +27,9 @@ from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
 from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, Crater, add_crater
+
+if TYPE_CHECKING:
+    from vtbdrake.components.sensors.laser_scanner import LaserScanner
 
 PAST_RIM = 1.5
 """How far beyond the rim the robot's centre ends a climb, in m: all of the robot is past it."""
@@ -182,7 +185,7 @@ class CraterScenario(SpaceClimberScenario):
         if self.scans:
             self._add_scanner(builder)
 
-    def _add_scanner(self, builder: VirtualTestbedBuilder) -> None:
+    def _add_scanner(self, builder: VirtualTestbedBuilder) -> LaserScanner:
         # Imported here: without the scanner, the testbed needs no Embree.
         from vtbdrake.components.ray_casting import RayCaster
         from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
@@ -198,6 +201,7 @@ class CraterScenario(SpaceClimberScenario):
         scanner = LaserScanner(plant, frame, caster, config=config, slice_period=0.2, errors=errors)
         builder.add("sense", "scanner", scanner)
         connect_laser_scanner(builder.diagram_builder, scanner, plant)
+        return scanner
 
     def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
         crater = self.crater

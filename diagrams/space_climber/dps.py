@@ -42,10 +42,40 @@ def make_dps(
     `Navigator`, which takes the port ``visual_odometry`` (3, m/s), the robot keeps a line over the ground in the
     direction of the heading, and stops when it tips.
     """
+    builder = DiagramBuilder()
+    impl = add_walker(builder, gait, period=period, morphology=morphology, clearance=clearance, navigator=navigator)
+    for signal in ("heading", "walk", *(["visual_odometry"] if navigator else [])):
+        builder.ExportInput(impl.GetInputPort(signal), signal)
+    dps = builder.Build()
+    dps.set_name("dps")
+    return dps
+
+
+def add_walker(
+    builder: DiagramBuilder,
+    gait: str,
+    *,
+    period: float,
+    morphology: Morphology | None = None,
+    clearance: float = 0.05,
+    navigator: bool = False,
+) -> Diagram:
+    """Add the subsystems of a DPS that walks, with the ports of its sensor signals and its command; see `make_dps`.
+
+    Args:
+        builder: The builder of the DPS.
+        gait: The gait.
+        period: Sample period in s.
+        morphology: The robot's.
+        clearance: Height to which the feet are lifted, in m.
+        navigator: Whether there is a `Navigator`.
+
+    Returns:
+        The subsystem ``impl``; its ports ``heading``, ``walk`` and, with a navigator, ``visual_odometry`` are free.
+    """
     if gait not in GAITS:
         raise ValueError(f"gait is '{gait}', but must be one of {', '.join(GAITS)}.")
     morphology = morphology or Morphology()
-    builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense(period=period, morphology=morphology))
     env = builder.AddNamedSystem("env", make_perceived_environment(period=period, morphology=morphology))
     walking = make_walking(GAITS[gait], period=period, morphology=morphology, clearance=clearance, navigator=navigator)
@@ -53,15 +83,11 @@ def make_dps(
     act = builder.AddNamedSystem("act", make_command_limiter(period=period, morphology=morphology))
     for signal in SENSOR_SIGNALS:
         builder.ExportInput(sense.GetInputPort(signal), signal)
-    for signal in ("heading", "walk", *(["visual_odometry"] if navigator else [])):
-        builder.ExportInput(impl.GetInputPort(signal), signal)
     builder.Connect(sense.get_output_port(), env.get_input_port())
     builder.Connect(env.GetOutputPort("pose"), impl.GetInputPort("pose"))
     builder.Connect(impl.GetOutputPort("joint_position"), act.GetInputPort("target"))
     builder.ExportOutput(act.GetOutputPort("joint_position"), "joint_position")
-    dps = builder.Build()
-    dps.set_name("dps")
-    return dps
+    return impl
 
 
 def _make_sense(*, period: float, morphology: Morphology) -> Diagram:
