@@ -117,6 +117,8 @@ def make_walking(
 ) -> Diagram:
     """Build the subsystem ``gait`` with the input ports ``pose``, ``heading`` and ``walk``.
 
+    With a navigator, its ``memory`` is the output port ``navigation``, beside ``joint_position``.
+
     Args:
         gait: The gait.
         period: Sample period in s.
@@ -141,6 +143,7 @@ def make_walking(
         builder.Connect(sensed.get_output_port(), system.get_input_port())
         builder.Connect(system.GetOutputPort("course"), ports["heading"])
         builder.Connect(system.GetOutputPort("walk"), ports["walk"])
+        builder.ExportOutput(system.GetOutputPort("memory"), "navigation")
     else:
         for signal in ("heading", "walk"):
             builder.ExportInput(ports[signal], signal)

@@ -37,6 +37,15 @@ def test_machine_is_not_believed_a_single_time_after_a_misfit() -> None:
     assert told == ["", "out of order", "ahead of time", "", "ahead of time", ""]
 
 
+@pytest.mark.parametrize("period", [0.04, 2.0, 100.0])
+def test_simulation_may_be_faster_than_real_time(period: float) -> None:
+    """Two messages are a period apart by its clock, and come a hundred times as fast."""
+    messages = [(0.01 * period * k, 50.0 + period * k) for k in range(20)]
+    assert set(take(MachineOrder(WINDOW, period), *messages)) == {""}
+    told = take(MachineOrder(WINDOW, period), *messages, (0.2 * period, 50.0 + 21.0 * period + 1.6))
+    assert told[-1] == "ahead of time"
+
+
 @pytest.mark.parametrize("jump", [-20.0, 20.0, 1e6])
 @pytest.mark.parametrize("period", [0.01, 1.0])
 def test_machine_is_believed_a_new_time_that_goes_on(jump: float, period: float) -> None:

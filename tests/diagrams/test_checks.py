@@ -27,6 +27,7 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.studies.light_cases import LightingScenario
 from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.studies.exploring import ExploringScenario
 from vtbdrake_diagrams.station import HOME, ArmStation
 
 SIMULATED_TIME = "its messages tell the time of a simulation, which stands still when the machine is held up"
@@ -38,6 +39,7 @@ SCENARIOS = {
     CartPoleScenario: {"sim.sys.cart_pole.pole_pin.position": 0.5},
     SpaceClimberScenario: {},
     CraterScenario: {},
+    ExploringScenario: {},
     SatelliteScenario: {},
     ArmMotionScenario: {},
     LightingScenario: {},
@@ -71,6 +73,7 @@ VARIANTS = (
     RouteScenario,
     PlainScenario,
     CraterScenario,
+    ExploringScenario,
     TorqueLimitedPendulumScenario,
 )
 # What is built and simulated in no time; of the others, all checks together take some ten seconds each.

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import DiscreteTimeIntegrator
 
 from tests.testbed.test_slow_part import Rig
-from vtbdrake.state.layout import FlatState
+from vtbdrake.state.layout import FlatState, LayoutError, StateLayout
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal, SlowPart, VirtualTestbedBuilder
 from vtbdrake.testbed.dps_state import DpsState
 
@@ -108,6 +108,25 @@ def test_sample_is_the_state_before_the_updates_of_its_instant(latency, offset):
             seen, abs=1.1e-8, rel=0.0
         )
         assert testbed.read(simulator.get_context(), f"{PLANNER}.sampled_at") == offset + tick * 0.05
+
+
+def test_part_of_a_dps_is_taken_from_the_whole():
+    """The planner alone, and all but it, between them hold all numbers; a layout with more is refused."""
+    testbed, simulator = started(PlannedScenario())
+    simulator.AdvanceTo(0.17)
+    whole = testbed.dps_layout.take(simulator.get_context())
+    parts = [
+        StateLayout(testbed.diagram, state=chosen, parameters=chosen)
+        for chosen in (lambda path: path == PLANNER, lambda path: path.startswith("dps") and path != PLANNER)
+    ]
+    taken = [part.part_of(whole) for part in parts]
+    for part, contents in zip(parts, taken, strict=True):
+        expected = part.take(simulator.get_context())
+        assert contents.names == expected.names and contents.abstract.keys() == expected.abstract.keys()
+        assert np.array_equal(contents.numbers, expected.numbers)
+    assert sum(contents.numbers.size for contents in taken) == whole.numbers.size > taken[0].numbers.size > 0
+    with pytest.raises(LayoutError, match=f"the contents lack {PLANNER}"):
+        testbed.dps_layout.part_of(taken[1])
 
 
 def test_copy_in_mid_work_continues_alike():

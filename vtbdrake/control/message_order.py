@@ -66,16 +66,19 @@ class MachineOrder(MessageOrder):
 
     A message is ``out of order`` if its time is before the last accepted one's, a ``duplicate`` if it is the same, and
     ``ahead of time`` if it is farther ahead of this computer's clock than any message before, by more than
-    `MAX_AHEAD`, unless the bus was lost in between. If no message continues the old time for longer than ``window``
-    seconds, and all that came meanwhile continue each other, the sender was restarted or its clock was set: its time is
-    accepted. A single message with a wrong time never is.
+    `MAX_AHEAD` and a ``period``, unless the bus was lost in between. If no message continues the old time for longer
+    than ``window`` seconds, and all that came meanwhile continue each other, the sender was restarted or its clock was
+    set: its time is accepted. A single message with a wrong time never is.
 
     Args:
         window: Time in seconds.
+        period: The time between two messages by the sender's clock, in seconds: a simulation that runs faster than real
+            time gets ahead by up to that from each to the next.
     """
 
-    def __init__(self, window: float) -> None:
+    def __init__(self, window: float, period: float = 0.0) -> None:
         self._window = window
+        self._most = MAX_AHEAD + period
         self._last = -inf  # time of the sender in the last accepted message
         self._ahead = inf  # by how much it was ahead of ours, at most: a message that has waited does not count
         # The same of the messages that do not continue this time, but each other, and when the first of them came.
@@ -87,22 +90,22 @@ class MachineOrder(MessageOrder):
         self._ahead = inf
 
     def _problem(self, sent: float, now: float, sender: str) -> str:
-        if self._last < sent <= now + self._ahead + MAX_AHEAD:
+        if self._last < sent <= now + self._ahead + self._most:
             return ""
         if sent == self._last:
             return "duplicate"
-        if self._other_last < sent <= now + self._other_ahead + MAX_AHEAD and self._other_since < inf:
+        if self._other_last < sent <= now + self._other_ahead + self._most and self._other_since < inf:
             if now - self._other_since > self._window:
                 return ""
             self._other_last, self._other_ahead = sent, max(self._other_ahead, sent - now)
-        elif not self._other_last - MAX_AHEAD <= sent <= self._other_last:  # else two of them were exchanged
+        elif not self._other_last - self._most <= sent <= self._other_last:  # else two of them were exchanged
             self._other_last, self._other_ahead, self._other_since = sent, sent - now, now
         return "out of order" if sent < self._last else "ahead of time"
 
     def note(self, sent: float, now: float, sender: str = "") -> None:
         if isnan(sent):
             return
-        ahead, fits = sent - now, self._last < sent <= now + self._ahead + MAX_AHEAD
+        ahead, fits = sent - now, self._last < sent <= now + self._ahead + self._most
         if fits and self._ahead < inf:
             ahead = max(ahead, self._ahead)
         self.clock_jumps += not fits

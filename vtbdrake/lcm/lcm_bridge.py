@@ -52,9 +52,9 @@ class LcmBridge(Bridge):
 
     What a machine sends has one sender: a message is ``out of order`` if its time is before the last accepted one's, a
     ``duplicate`` if it is the same, and ``ahead of time`` if it is farther ahead of this computer's clock than any
-    message before, by more than `MAX_AHEAD`, unless the bus was lost in between. A machine that was restarted, or whose
-    clock was set, is accepted after ``reorder_window`` seconds in which no message has continued its old time, and all
-    have continued each other; see `MachineOrder`.
+    message before, by more than `MAX_AHEAD` and the period of its channel, unless the bus was lost in between. A
+    machine that was restarted, or whose clock was set, is accepted after ``reorder_window`` seconds in which no message
+    has continued its old time, and all have continued each other; see `MachineOrder`.
 
     A command u may have several senders, whose clocks differ: the newest by arrival counts. Only if the messages name
     their senders (`command_map`, ``vector_map(..., sender=)``), one that arrives within ``reorder_window`` after a
@@ -87,6 +87,7 @@ class LcmBridge(Bridge):
         commands: Sequence[LcmMap] = (),
         reported: Mapping[str, str] | None = None,
         robot_mode: RobotMode | None = None,
+        periods: Mapping[str, float] | None = None,
         watch: bool | None = None,
         reorder_window: float = 0.1,
         connect_timeout: float = 2.0,
@@ -104,6 +105,8 @@ class LcmBridge(Bridge):
             reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
                 machine says it executes.
             robot_mode: The mode that the machine reports, in a map of ``sense``; None if it does not.
+            periods: By channel of ``sense``, seconds between two messages, see `Protocol`; channels on which a message
+                comes in each cycle need none.
             watch: Whether to listen on the actuator channels for other publishers. By default on every bus that others
                 can be on.
             reorder_window: Window in seconds, see above.
@@ -132,19 +135,13 @@ class LcmBridge(Bridge):
         self.commands = {name: ReceivedSignal() for map in commands for name in map.signals}
         self.sent = {signal.name: SentSignal() for signal in interface.act}
         received = self.sensed | reports.received
-        self._readers = [ChannelReader(map, _signals(published, map), received, reorder_window) for map in sense]
-        self._rejections: Counter[tuple[str, str, tuple[tuple[str, str], ...]]] = Counter()  # to be answered
-        self._readers += [
-            ChannelReader(
-                map,
-                _signals(interface.commands, map),
-                self.commands,
-                reorder_window,
-                several_senders=True,
-                rejected=partial(self._note_rejected, map.channel),
-            )
-            for map in commands
+        periods = periods or {}
+        self._readers = [
+            ChannelReader(map, _signals(published, map), received, reorder_window, period=periods.get(map.channel, 0.0))
+            for map in sense
         ]
+        self._rejections: Counter[tuple[str, str, tuple[tuple[str, str], ...]]] = Counter()  # to be answered
+        self._readers += [self._command_reader(map, reorder_window) for map in commands]
         self._writers = [ChannelWriter(map, _signals(interface.act, map), self.sent) for map in act]
 
         self._watch = not url.startswith(_PRIVATE) if watch is None else watch
@@ -155,6 +152,16 @@ class LcmBridge(Bridge):
         self._mark_sent: int | None = None  # on which connection
         handlers = self._handlers([map.channel for map in act])
         self.link = LcmLink(url, handlers, connect_timeout=connect_timeout, reconnected=self._expect_gap)
+
+    def _command_reader(self, map: LcmMap, reorder_window: float) -> ChannelReader:
+        return ChannelReader(
+            map,
+            _signals(self.interface.commands, map),
+            self.commands,
+            reorder_window,
+            several_senders=True,
+            rejected=partial(self._note_rejected, map.channel),
+        )
 
     def _handlers(self, act_channels: Sequence[str]) -> dict[str, Handler]:
         """Return the function that takes the messages of each channel that is listened on."""
@@ -323,6 +330,7 @@ class ChannelReader:
         received: Mapping[str, ReceivedSignal],
         reorder_window: float,
         *,
+        period: float = 0.0,
         several_senders: bool = False,
         clock: Callable[[], float] = time.monotonic,
         rejected: Callable[[str, Mapping[str, str]], None] | None = None,
@@ -334,6 +342,7 @@ class ChannelReader:
             signals: The signals of the map.
             received: The received signals, by name; the signals of the map are updated.
             reorder_window: Window in seconds, see `LcmBridge`.
+            period: Time between two messages of a machine in seconds, see `MachineOrder`.
             several_senders: Whether the signals are commands u, which several may send.
             clock: The time at which messages arrive, in seconds.
             rejected: Called with the sender's name, and the reasons by signal, for a message with a rejected signal.
@@ -346,8 +355,8 @@ class ChannelReader:
         self._map = map
         self._names_sender = several_senders and map.sender is not None
         self._decode = map.decoder(signals)
-        order = CommandOrder if several_senders else MachineOrder
-        self._inbox = Inbox(signals, received, order(reorder_window))
+        order = CommandOrder(reorder_window) if several_senders else MachineOrder(reorder_window, period)
+        self._inbox = Inbox(signals, received, order)
         self._rejected = rejected
 
     @property

@@ -82,6 +82,7 @@ class Protocol:
             commands=self.commands,
             reported=self.reported,
             robot_mode=self.robot_mode,
+            periods=self.periods,
             **options,
         )
 

@@ -56,7 +56,8 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
         vectors = {signal.name: _KeptSamples() for signal in signals if signal.is_vector}
         abstract = {signal.name: ReceivedSignal() for signal in (*signals, *reported) if signal.name not in vectors}
         for map in maps:
-            trouble.extend(_read_channel(ordered, map, [*signals, *reported], vectors | abstract))
+            period, carried = protocol.periods.get(map.channel, 0.0), [*signals, *reported]
+            trouble.extend(_read_channel(ordered, map, carried, vectors | abstract, period))
         return {
             name: checked_series(f"{source}: {name}", np.array(samples.times), np.array(samples.values), remarks)
             for name, samples in vectors.items()
@@ -140,13 +141,17 @@ def _in_order(places: np.ndarray) -> np.ndarray:
 
 
 def _read_channel(
-    events: _OrderedEvents, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal]
+    events: _OrderedEvents,
+    map: LcmMap,
+    signals: Sequence[Signal],
+    received: Mapping[str, ReceivedSignal],
+    period: float = 0.0,
 ) -> Iterator[str]:
-    """Receive the messages of a channel by the rules of a bridge, and yield what is missing."""
+    """Receive the messages of a channel, ``period`` seconds apart, by the rules of a bridge; yield what is missing."""
     by_name = {signal.name: signal for signal in signals}
     carried = [by_name[name] for name in map.signals]
     try:
-        reader = ChannelReader(map, carried, received, _REORDER_WINDOW, clock=lambda: events.now)
+        reader = ChannelReader(map, carried, received, _REORDER_WINDOW, period=period, clock=lambda: events.now)
     except ValueError as error:  # A map of commands need not decode.
         yield f"{', '.join(map.signals)}: {error}"
         return

@@ -13,6 +13,8 @@ from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
 from vtbdrake.state.systems import stateful_leaves, write_group
 from vtbdrake.state.variables import Variable
 
+_ABSTRACT = "/abstract"
+
 
 class LayoutError(ValueError):
     """Contents have another layout."""
@@ -70,7 +72,7 @@ class StateLayout:
                 self._groups.append((system, groups))
             if state(path) and (codecs := abstract_state(path, system, system.CreateDefaultContext())):
                 self._abstract.append((path, system, codecs))
-        self.names = (*self._slices, *(f"{path}/abstract" for path, _, _ in self._abstract))
+        self.names = (*self._slices, *(f"{path}{_ABSTRACT}" for path, _, _ in self._abstract))
         self.size = start
 
     def indices_in(self, whole: StateLayout) -> np.ndarray:
@@ -145,6 +147,24 @@ class StateLayout:
                 write_group(leaf_context, group, index, contents.numbers[place])
         for system, write in writers:
             write(system.GetMyMutableContextFromRoot(context))
+
+    def part_of(self, contents: FlatState) -> FlatState:
+        """Return the contents of this layout, out of contents that have more: of another Diagram with the same systems.
+
+        Args:
+            contents: Contents with all groups and abstract states of this layout.
+
+        Raises:
+            LayoutError: They lack one.
+        """
+        if missing := sorted(set(self.names) - set(contents.names)):
+            raise LayoutError(f"the contents lack {missing[0]}")
+        sizes = [int(name.rpartition("(")[2].rstrip(")")) for name in contents.names if not name.endswith(_ABSTRACT)]
+        parts = dict(zip(contents.names, np.split(contents.numbers, np.cumsum(sizes)), strict=False))
+        numbers = np.concatenate([np.zeros(0), *(parts[name] for name in self._slices)])
+        prefixes = tuple(f"{path}/" for path, _, _ in self._abstract)
+        abstract = {key: array for key, array in contents.abstract.items() if key.startswith(prefixes)}
+        return FlatState(self.names, numbers, abstract)
 
     def check(self, contents: FlatState) -> None:
         """Check that contents are of this layout.
