@@ -5,18 +5,21 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import Diagram
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import Diagram, OutputPort, System
 
+from vtbdrake.common.arrays import Array
 from vtbdrake.common.scan import Scan
 from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import HISTORY_LENGTH, DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.pedestrian import PedestrianDriftModel
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
@@ -36,7 +39,12 @@ from vtbdrake_diagrams.forest.world.routes import Route
 from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.world.vegetation import Vegetation
 
+if TYPE_CHECKING:
+    from vtbdrake_diagrams.forest.world.driver import Driver
+
 PERCEPTIONS = ("scanner", "stereo", "both")
+CARRIERS = ("machine", "hand", "back")
+"""The carriers of the unit: a machine on wheels, or a worker on foot, in the hand or on the back."""
 
 # The least standard deviation of ranges, in m, that a detector assumes, also of a scanner with exact ranges.
 _LEAST_RANGE_NOISE = 0.005
@@ -46,6 +54,11 @@ _LEAST_RANGE_NOISE = 0.005
 # for the plain; the first seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not
 # contained.
 _LEVELLING = 0.001
+# The same in rad of a unit that a worker carries, and the height in m by which the axes of trunks are below it.
+_LEVELLING_ON_FOOT = 0.005
+_BELOW_ON_FOOT = 1.0
+# Standard deviation of the error that all steps of a worker have in common, as a share of their length; assumed.
+_STEP_LENGTH = 0.08
 
 
 def plant_config() -> MultibodyPlantConfig:
@@ -68,10 +81,11 @@ def scanner_config() -> LaserScannerConfig:
 
 @dataclass
 class CarrierScenario(Scenario):
-    """A carrier with scanner, IMU and wheel odometry drives on routes among landmarks.
+    """A carrier with scanner, IMU and wheel odometry drives on routes among landmarks, or a worker carries the unit.
 
-    The driver follows the route that the DPS advises, which the command ``u.route`` sets. The true pose of the carrier
-    is ``sim.sys.carrier.base.pose``.
+    A worker on foot has no wheels: the speed comes from steps that the IMU shows (`Pedometer`). The driver, or the
+    worker, follows the route that the DPS advises, which the command ``u.route`` sets. The true pose of the carrier, on
+    foot of the unit, is ``sim.sys.carrier.base.pose``.
     """
 
     # The class of the landmarks in truth and map.
@@ -89,6 +103,14 @@ class CarrierScenario(Scenario):
     map_seed: int = setting(0, "Determines the errors of the map.", ge=0)
     map_file: str = setting("", "A GeoJSON file to take the global map from instead; empty for none.")
     revises_map: bool = setting(False, "Whether the DPS revises its map while it drives, see `Tracker`.")
+    carrier: str = setting(
+        "machine",
+        "A machine on wheels, or a worker on foot with the unit in the hand or on the back.",
+        choices=CARRIERS,
+    )
+    step_frequency: float = setting(
+        1.85, "Steps per second of the worker at 1.2 m/s, which the unit does not know.", unit="Hz", ge=1.2, le=2.5
+    )
     # The laser scanner, and the errors of its ranges in m.
     scanner: LaserScannerConfig = field(default_factory=scanner_config)
     scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
@@ -97,7 +119,7 @@ class CarrierScenario(Scenario):
     )
     scanner_forward: float = setting(
         0.9,
-        "Distance of the scanner in front of the middle of the carrier.",
+        "Distance of the scanner in front of the middle of the machine; on foot, it is where the IMU is.",
         unit="m",
         ge=-1.25,
         le=1.25,
@@ -139,6 +161,11 @@ class CarrierScenario(Scenario):
                 f"{type(self).__name__}.route must be the number of one of {len(routes)} routes, not {self.route}"
             )
 
+    @property
+    def is_on_foot(self) -> bool:
+        """Return whether a worker carries the unit."""
+        return self.carrier != "machine"
+
     def ground(self) -> Ground:
         """Return the ground."""
         return Ground(self.seed, relief=self.relief, bumps=self.bumps)
@@ -147,6 +174,8 @@ class CarrierScenario(Scenario):
     def X_BL(self) -> RigidTransform:
         """The pose of the scanner L on the carrier B."""
         tilt = RollPitchYaw(0.0, np.radians(self.scanner_tilt_deg), 0.0)
+        if self.is_on_foot:
+            return RigidTransform(tilt, [0.0, 0.0, 0.0])
         return RigidTransform(tilt, [self.scanner_forward, 0.0, self.scanner_height])
 
     @abstractmethod
@@ -211,11 +240,12 @@ class CarrierScenario(Scenario):
 
     def interface(self) -> Interface:
         routes = range(len(self.routes()))
+        odometry = Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD)
         return Interface(
             sense=[
                 *self.perception_signals(),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-50.0, upper=50.0, max_age=5 * PERIOD),
-                Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD),
+                *([] if self.is_on_foot else [odometry]),
             ],
             act=[Signal("route", size=1, values=routes, idle=float(self.route))],
             commands=[Signal("route", size=1, values=routes, default=float(self.route))],
@@ -230,12 +260,13 @@ class CarrierScenario(Scenario):
         return (LandmarkSensor(self.detector(), field_of_view=self.scanner.azimuth),)
 
     def scanner_accuracy(self) -> dict[str, float]:
-        """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
+        """Return angles between rays (rad), noise of ranges (m) and z of the ground (m), as detectors name them."""
         rows, columns = raster_size(self.scanner)
         return {
             "azimuth_step": self.scanner.azimuth / columns,
             "elevation_step": self.scanner.elevation / rows,
             "range_noise": max(self.scanner_errors.noise, _LEAST_RANGE_NOISE),
+            "ground_height": -self.scanner_height if self.is_on_foot else 0.0,
         }
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
@@ -246,11 +277,17 @@ class CarrierScenario(Scenario):
             landmarks,
             sensor=(x, y),
             field_of_view=self.scanner.azimuth,
-            scan_deviation=_LEVELLING * z,
+            scan_deviation=_LEVELLING_ON_FOOT * _BELOW_ON_FOOT if self.is_on_foot else _LEVELLING * z,
             correlation=correlation,
             revises=self.revises_map,
         )
-        return LocalizationUnit(ConstellationMap(landmarks, correlation=correlation), tracker)
+        if self.is_on_foot:
+            tracker = replace(tracker, odometry_deviation=_STEP_LENGTH)
+        return LocalizationUnit(ConstellationMap(landmarks, correlation=correlation), tracker, drift=self.drift())
+
+    def drift(self) -> DriftModel:
+        """Return the drift of the dead reckoning."""
+        return PedestrianDriftModel() if self.is_on_foot else DriftModel()
 
     def make_dps(self) -> Diagram:
         world_map = self.global_map()
@@ -262,12 +299,27 @@ class CarrierScenario(Scenario):
                 raise GeoJsonError(f"{self.map_file}: {error}") from error
             raise
         localizer = Localizer(self.sensors(), unit)
-        return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
+        latency, drift = self.localizer_latency, self.drift()
+        return make_dps(world_map, localizer, signals, latency=latency, drift=drift, on_foot=self.is_on_foot)
 
     def deployment(self) -> Deployment:
-        return make_deployment((scan_map("SCAN", "scan"), 1.0 / self.scanner.frequency))
+        return make_deployment((scan_map("SCAN", "scan"), 1.0 / self.scanner.frequency), on_foot=self.is_on_foot)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(self.plant_config)
+        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
+        self.add_landscape(plant)
+        route = self.routes()[self.route]
+        start = self.start % route.length
+        place = {"position": route.position(start), "heading": route.heading(start)}
+        if self.is_on_foot:
+            self._add_worker(builder, **place)
+        else:
+            self._add_machine(builder, **place)
+        self.add_perception(builder)
+
+    def _add_machine(self, builder: VirtualTestbedBuilder, *, position: Array, heading: float) -> None:
+        """Add the machine with its wheels, odometer and driver, and what is believed of them."""
         # Imported here: the DPS on the carrier runs without a plant.
         from vtbdrake_diagrams.forest.belief import declare_belief
         from vtbdrake_diagrams.forest.world.carrier import (
@@ -277,46 +329,74 @@ class CarrierScenario(Scenario):
             add_carrier,
             standing_pose,
         )
-        from vtbdrake_diagrams.forest.world.driver import Driver
 
-        plant, _ = builder.add_plant(self.plant_config)
-        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
-        carrier, ground, routes = Carrier(), self.ground(), self.routes()
-        self.add_landscape(plant)
+        plant, carrier, ground = builder.plant, Carrier(), self.ground()
         base = add_carrier(plant, carrier, self.X_BL)
-        route = routes[self.route]
-        start = self.start % route.length
-        X_WB = standing_pose(carrier, ground, position=route.position(start), heading=route.heading(start))
+        X_WB = standing_pose(carrier, ground, position=position, heading=heading)
         plant.SetDefaultFloatingBaseBodyPose(base, X_WB)
         plant.Finalize()
-
         wheels = builder.add("act", "wheels", Wheels(plant, base, carrier, ground))
-        driver = Driver(
-            plant,
-            base,
-            routes,
-            wheel_base=carrier.wheel_base,
-            period=PERIOD,
-            speed=self.speed,
-            laps=self.laps,
-            route=self.route,
-            along=start,
-        )
-        builder.add("act", "driver", driver)
-        for system in (wheels, driver):
-            builder.connect(plant.get_state_output_port(), system.GetInputPort("state"))
-        builder.connect(driver.GetOutputPort("controls"), wheels.GetInputPort("controls"))
-        builder.connect(wheels.GetOutputPort("spatial_force"), plant.get_applied_spatial_force_input_port())
-        builder.sim_actuator("route", driver.GetInputPort("route"))
-
-        builder.add_sensor("imu", Imu(plant, base.body_frame(), period=PERIOD, errors=self.imu_errors))
+        state = plant.get_state_output_port()
+        driver = self._add_driver(builder, state, start=base.floating_positions_start(), wheel_base=carrier.wheel_base)
+        self._connect_motion(builder, wheels, driver)
+        self._add_imu(builder, base)
         odometer = WheelOdometer(period=PERIOD, scale=self.odometry_scale, errors=self.odometry_errors)
         builder.add("sense", "odometry", odometer)
         builder.connect(wheels.GetOutputPort("speed"), odometer.GetInputPort("speed"))
         builder.sim_sensor("odometry", odometer.get_output_port())
-        self.add_perception(builder)
         # The samples of IMU and odometry are one period old.
-        declare_belief(builder, carrier, ground, routes, age=PERIOD)
+        declare_belief(builder, carrier, ground, self.routes(), age=PERIOD)
+
+    def _add_worker(self, builder: VirtualTestbedBuilder, *, position: Array, heading: float) -> None:
+        """Add the worker who carries the unit along the route, and what is believed of both."""
+        from vtbdrake_diagrams.forest.belief import declare_belief_on_foot
+        from vtbdrake_diagrams.forest.world.worker import Legs, Worker, add_worker
+
+        plant, ground = builder.plant, self.ground()
+        worker = Worker.carrying(self.carrier, height=self.scanner_height, step_frequency=self.step_frequency)
+        base = add_worker(plant, worker, self.X_BL)
+        plant.Finalize()
+        legs = Legs(plant, base, worker, ground, position=position, heading=heading, seed=self.seed)
+        plant.SetDefaultFloatingBaseBodyPose(base, legs.unit_pose(position, heading, 0.0, 0.0, time=0.0))
+        builder.add("act", "legs", legs)
+        driver = self._add_driver(builder, legs.GetOutputPort("walker"), start=0, wheel_base=0.0)
+        self._connect_motion(builder, legs, driver)
+        self._add_imu(builder, base)
+        declare_belief_on_foot(builder, worker, ground, self.routes(), age=PERIOD)
+
+    def _add_imu(self, builder: VirtualTestbedBuilder, base: RigidBody) -> None:
+        builder.add_sensor("imu", Imu(builder.plant, base.body_frame(), period=PERIOD, errors=self.imu_errors))
+
+    def _add_driver(
+        self, builder: VirtualTestbedBuilder, state: OutputPort, *, start: int, wheel_base: float
+    ) -> Driver:
+        """Add the driver, who sees a pose in a port from ``start`` on, and return it."""
+        from vtbdrake_diagrams.forest.world.driver import Driver
+
+        routes = self.routes()
+        driver = Driver(
+            routes,
+            size=state.size(),
+            start=start,
+            wheel_base=wheel_base,
+            period=PERIOD,
+            speed=self.speed,
+            laps=self.laps,
+            route=self.route,
+            along=self.start % routes[self.route].length,
+        )
+        builder.add("act", "driver", driver)
+        builder.connect(state, driver.GetInputPort("state"))
+        builder.sim_actuator("route", driver.GetInputPort("route"))
+        return driver
+
+    @staticmethod
+    def _connect_motion(builder: VirtualTestbedBuilder, motion: System, driver: Driver) -> None:
+        """Connect wheels or legs with the plant and with their driver."""
+        plant = builder.plant
+        builder.connect(plant.get_state_output_port(), motion.GetInputPort("state"))
+        builder.connect(driver.GetOutputPort("controls"), motion.GetInputPort("controls"))
+        builder.connect(motion.GetOutputPort("spatial_force"), plant.get_applied_spatial_force_input_port())
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         """Add the sensor that detects landmarks to the simulated world: the scanner."""
@@ -446,7 +526,7 @@ class ForestScenario(CarrierScenario):
             maps.append((scan_map("SCAN", "scan"), 1.0 / self.scanner.frequency))
         if self.has_stereo:
             maps.append((image_array_map("IMAGES", {name: name for name in IMAGES}), 1.0 / self.stereo.fps))
-        return make_deployment(*maps)
+        return make_deployment(*maps, on_foot=self.is_on_foot)
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         if self.has_scanner:

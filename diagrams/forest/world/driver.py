@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import cos, hypot, sin
 
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.state import AddressedSystem, Quantity
@@ -33,10 +31,10 @@ class Driver(AddressedSystem):
         output_ports:
         - controls
 
-    ``state`` is the plant's [q; v], ``route`` the number of the advised route. ``controls`` are the speed (m/s) and the
-    curvature (1/m, to the left) of the path of the middle of the rear axle. The curvature follows pure pursuit: of
-    the circle through a point some metres ahead on the route (Coulter, "Implementation of the pure pursuit path
-    tracking algorithm", CMU-RI-TR-92-01, 1992).
+    ``state`` has the pose of the body B, as in a plant's [q; v], ``route`` the number of the advised route.
+    ``controls`` are the speed (m/s) and the curvature (1/m, to the left) of the path of the middle of the rear axle.
+    The curvature follows pure pursuit: of the circle through a point some metres ahead on the route (Coulter,
+    "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992).
 
     The driver changes to the advised route where both routes are the same road (the routes of `strip_roads` begin
     alike). After ``laps`` laps, the driver stops.
@@ -46,10 +44,10 @@ class Driver(AddressedSystem):
 
     def __init__(
         self,
-        plant: MultibodyPlant,
-        body: RigidBody,
         routes: Sequence[Route],
         *,
+        size: int,
+        start: int,
         wheel_base: float,
         period: float,
         speed: float,
@@ -60,10 +58,10 @@ class Driver(AddressedSystem):
         """Declare the driver.
 
         Args:
-            plant: The finalized plant.
-            body: The carrier's body B.
             routes: The routes by number.
-            wheel_base: Distance of the carrier's axles in m.
+            size: The size of the port ``state``.
+            start: Where quaternion and position (m) of B begin in it.
+            wheel_base: Distance of the carrier's axles in m; 0 for a worker on foot.
             period: Sample period in s.
             speed: The speed at which the driver drives, in m/s.
             laps: The number of laps after which the driver stops.
@@ -72,8 +70,8 @@ class Driver(AddressedSystem):
         """
         super().__init__()
         self._routes, self._laps, self._rear = tuple(routes), int(laps), wheel_base / 2.0
-        self._q = body.floating_positions_start()
-        self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._q = start
+        self._state = self.DeclareVectorInputPort("state", size)
         self._advice = self.DeclareVectorInputPort("route", 1)
         self._progress = self.declare_discrete_state(
             route=Quantity(route, bounds=(0.0, len(self._routes) - 1.0)), along=Quantity(along, "m"), lap=Quantity(0.0)

@@ -76,7 +76,15 @@ def world(
         source = builder.AddSystem(ConstantVectorSource(list(controls)))
     else:
         source = Driver(
-            plant, body, routes, wheel_base=1.6, period=0.02, speed=1.0, laps=laps, route=route, along=along
+            routes,
+            size=plant.num_multibody_states(),
+            start=body.floating_positions_start(),
+            wheel_base=1.6,
+            period=0.02,
+            speed=1.0,
+            laps=laps,
+            route=route,
+            along=along,
         )
         builder.AddNamedSystem("driver", source)
         builder.Connect(plant.get_state_output_port(), source.GetInputPort("state"))

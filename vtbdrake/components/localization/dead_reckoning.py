@@ -200,12 +200,15 @@ class DeadReckoning(AddressedSystem):
     speed and turn rate keep their values.
     """
 
-    def __init__(self, *, period: float, axle: float = 0.0) -> None:
+    def __init__(self, *, period: float, axle: float = 0.0, sway: float = 0.1, still_rate: float = 0.02) -> None:
         """Declare the system.
 
         Args:
             period: Sample period of both sensors in s.
             axle: The x coordinate in B, in m, of the point A that does not move sideways; negative behind Bo.
+            sway: The initial value of the parameter ``sway``, in m/s^2; more for a unit that a walker carries.
+            still_rate: The initial value of the parameter ``still_rate``, in rad/s; 0 for a carrier that is never
+                still, as a unit in the hand.
 
         Raises:
             ValueError: The period is not positive.
@@ -242,9 +245,9 @@ class DeadReckoning(AddressedSystem):
         for port, group in (("motion", self._motion), ("history", self._history)):
             self.DeclareStateOutputPort(port, group.index)
         self._settings = self.declare_parameters(
-            sway=Quantity(0.1, "m/s^2", (0.0, 10.0)),
+            sway=Quantity(sway, "m/s^2", (0.0, 10.0)),
             still_speed=Quantity(0.03, "m/s", (0.0, 1.0)),
-            still_rate=Quantity(0.02, "rad/s", (0.0, 1.0)),
+            still_rate=Quantity(still_rate, "rad/s", (0.0, 1.0)),
             bias_drift=Quantity(3e-5, "rad/s^1.5", (0.0, 1.0)),
             gyro_noise=Quantity(2e-3, "rad/s", (0.0, 1.0)),
             axle=Quantity(axle, "m", (-10.0, 10.0)),
