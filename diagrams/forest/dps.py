@@ -123,6 +123,7 @@ def _make_env(
     if on_foot:
         pedometer = builder.AddNamedSystem("pedometer", Pedometer(period=PERIOD))
         builder.ConnectInput(imu, pedometer.GetInputPort("imu"))
+        builder.Connect(reckoning.GetOutputPort("motion"), pedometer.GetInputPort("motion"))
         builder.Connect(pedometer.GetOutputPort("odometry"), reckoning.GetInputPort("odometry"))
     else:
         builder.ExportInput(reckoning.GetInputPort("odometry"), "odometry")

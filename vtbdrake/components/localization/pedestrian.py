@@ -14,13 +14,17 @@ gyros and accelerometers of the same IMU.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, sqrt
+from math import cos, inf, sin, sqrt
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.common.arrays import Array
 from vtbdrake.common.settings import setting
-from vtbdrake.components.localization.dead_reckoning import DriftModel
+from vtbdrake.components.localization.dead_reckoning import MOTION, DriftModel
 from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.state.declarations import NamedView
 
 # Readings of at least this size, in rad/s or m/s^2, are faults.
 _LARGEST = 1e3
@@ -28,8 +32,8 @@ _LARGEST = 1e3
 _SHORTEST_STEP = 0.3
 # After this time in s without a step, the walker stands.
 _LONGEST_STEP = 1.0
-# The time in s that a first step is taken to last, as nothing shows when it began.
-_FIRST_STEP = 0.55
+# A walker stands who has not swung for this time in s.
+_STILL = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,18 @@ class PedestrianDriftModel(DriftModel):
     along: float = setting(0.06, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)
     across: float = setting(0.12, "Standard deviation sideways, by the sway and the pointing.", unit="m/sqrt(m)", ge=0)
     heading: float = setting(0.002, "Standard deviation of the heading.", unit="rad/sqrt(s)", ge=0)
+    unseen: float = setting(
+        0.15, "Standard deviation of motion that no step shows, as the first step, per axis.", unit="m/sqrt(s)", ge=0
+    )
+
+    def covariance(self, motion: ArrayLike, duration: float) -> Array:
+        """Return the covariance (3, 3) of a motion, see `DriftModel.covariance`, with the motion that no step shows.
+
+        Args:
+            motion: The motion X_AB = [x, y, heading], (3,) in m and rad, assumed to follow an arc.
+            duration: The duration of the motion in s.
+        """
+        return super().covariance(motion, duration) + np.diag([1.0, 1.0, 0.0]) * self.unseen**2 * duration
 
 
 class Pedometer(AddressedSystem):
@@ -55,16 +71,26 @@ class Pedometer(AddressedSystem):
         name: Pedometer
         input_ports:
         - imu
+        - motion
         output_ports:
         - odometry
 
-    ``imu`` is [angular velocity (rad/s); specific force (m/s^2)] of a unit that is worn or held, in any orientation:
-    only the magnitude f of the specific force is used, less its mean over ``mean_time`` and smoothed over ``smoothing``
-    (time constants in s). A step is counted when it rises above ``threshold`` after it has been below -``threshold``,
-    0.3 s after the last one at least. Its length is ``gain`` (f_max - f_min)^(1/4), see the module, and its duration
-    the time since the step before, 0.55 s if the walker stood. ``odometry`` is the quotient (m/s), smoothed over
-    ``speed_smoothing``; it goes to 0 when there has been no step for a second. So it begins one step late, and ends one
-    second late.
+    ``imu`` is [angular velocity (rad/s); specific force (m/s^2)] of a unit that is worn or held, ``motion`` the port of
+    a `DeadReckoning`, for roll and pitch.
+
+    *Steps.* Only the magnitude f of the specific force is used, less its mean over ``mean_time`` and smoothed over
+    ``smoothing`` (time constants in s). A step is counted when it rises above ``threshold`` after it has been below
+    -``threshold``, 0.3 s after the last one at least. Its length is ``gain`` (f_max - f_min)^(1/4), see the module, and
+    its duration the time since the step before. The quotient is the speed by steps, u. It is 0 when there has been no
+    step for a second. At the first step, and when the force has swung by half of ``threshold`` within half a second
+    before it, u is unknown, and taken to be the present speed.
+
+    *Between steps.* The speed v in ``odometry`` (m/s, along x of H) follows the levelled acceleration a along x, and u
+    with the time constant ``blending`` (s):
+
+        v <- v + T a + T / blending (u - v).
+
+    So a walk is noticed when it begins, before its first step is counted, and the speed follows the surge of each step.
 
     A sample with a number that is not finite, or with one of 1,000 or more, is left out and counted in ``ignored``.
     State: ``speed``, the number of ``steps``, and what the filter remembers.
@@ -84,6 +110,7 @@ class Pedometer(AddressedSystem):
             raise ValueError(f"Pedometer: the period is positive, in s, not {period!r}")
         self._period = period
         self._imu = self.DeclareVectorInputPort("imu", 6)
+        self._motion = self.DeclareVectorInputPort("motion", MOTION.size)
         self._speed = self.declare_discrete_state(speed=Quantity(0.0, "m/s"))
         self._memory = self.declare_discrete_state(
             samples=Quantity(bounds=(0.0, inf)),
@@ -95,6 +122,8 @@ class Pedometer(AddressedSystem):
             least=Quantity(0.0, "m/s^2"),
             was_below=Quantity(0.0, bounds=(0.0, 1.0)),
             since_step=Quantity(_LONGEST_STEP, "s", (0.0, inf)),
+            since_swing=Quantity(_STILL, "s", (0.0, inf)),
+            is_first=Quantity(0.0, bounds=(0.0, 1.0)),
             step_speed=Quantity(0.0, "m/s"),
         )
         self._settings = self.declare_parameters(
@@ -102,7 +131,7 @@ class Pedometer(AddressedSystem):
             threshold=Quantity(0.5, "m/s^2", (0.0, 10.0)),
             mean_time=Quantity(2.0, "s", (0.1, 60.0)),
             smoothing=Quantity(0.04, "s", (0.0, 1.0)),
-            speed_smoothing=Quantity(0.3, "s", (0.0, 10.0)),
+            blending=Quantity(0.7, "s", (0.1, 60.0)),
         )
         self.DeclareStateOutputPort("odometry", self._speed.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -111,23 +140,36 @@ class Pedometer(AddressedSystem):
         memory, settings, T = self._memory.mutable(state), self._settings.view(context), self._period
         sample = self._imu.Eval(context).tolist()
         memory.since_step += T
+        ahead = 0.0
         if all(abs(number) < _LARGEST for number in sample):
-            force = sqrt(sum(f * f for f in sample[3:]))
-            # At first the mean over what there was so far.
-            memory.mean += max(T / settings.mean_time, 1.0 / (memory.samples + 1.0)) * (force - memory.mean)
-            memory.swing += T / (T + settings.smoothing) * (force - memory.mean - memory.swing)
-            memory.samples += 1.0
-            memory.largest, memory.least = max(memory.largest, memory.swing), min(memory.least, memory.swing)
-            memory.was_below = float(memory.was_below or memory.swing < -settings.threshold)
-            if memory.was_below and memory.swing > settings.threshold and memory.since_step > _SHORTEST_STEP:
-                duration = memory.since_step if memory.since_step < _LONGEST_STEP else _FIRST_STEP
-                memory.step_speed = settings.gain * (memory.largest - memory.least) ** 0.25 / duration
-                memory.steps += 1.0
-                memory.since_step = memory.was_below = 0.0
-                memory.largest = memory.least = memory.swing
+            self._count(memory, sqrt(sum(f * f for f in sample[3:])), settings)
+            motion = MOTION.view(self._motion.Eval(context))
+            fx, fy, fz = sample[3:]
+            ahead = cos(motion.pitch) * fx + sin(motion.pitch) * (sin(motion.roll) * fy + cos(motion.roll) * fz)
         else:
             memory.ignored += 1.0
-        if memory.since_step >= _LONGEST_STEP:
-            memory.step_speed = memory.largest = memory.least = 0.0
         speed = self._speed.mutable(state)
-        speed.speed += T / (T + settings.speed_smoothing) * (memory.step_speed - speed.speed)
+        if memory.since_step >= _LONGEST_STEP:
+            memory.step_speed = 0.0 if memory.since_swing > _STILL else speed.speed
+        elif memory.is_first:
+            memory.step_speed = speed.speed
+        if memory.since_swing > _STILL:
+            memory.largest = memory.least = 0.0
+        speed.speed += T * (ahead + (memory.step_speed - speed.speed) / settings.blending)
+
+    def _count(self, memory: NamedView, force: float, settings: NamedView) -> None:
+        """Bring the memory to what it is after a specific force of this magnitude, in m/s^2."""
+        T = self._period
+        # At first the mean over what there was so far.
+        memory.mean += max(T / settings.mean_time, 1.0 / (memory.samples + 1.0)) * (force - memory.mean)
+        memory.swing += T / (T + settings.smoothing) * (force - memory.mean - memory.swing)
+        memory.samples += 1.0
+        memory.largest, memory.least = max(memory.largest, memory.swing), min(memory.least, memory.swing)
+        memory.since_swing = 0.0 if abs(memory.swing) > 0.5 * settings.threshold else memory.since_swing + T
+        memory.was_below = float(memory.was_below or memory.swing < -settings.threshold)
+        if memory.was_below and memory.swing > settings.threshold and memory.since_step > _SHORTEST_STEP:
+            memory.is_first = float(memory.since_step >= _LONGEST_STEP)
+            memory.step_speed = settings.gain * (memory.largest - memory.least) ** 0.25 / memory.since_step
+            memory.steps += 1.0
+            memory.since_step = memory.was_below = 0.0
+            memory.largest = memory.least = memory.swing
