@@ -46,11 +46,11 @@ class PedestrianDriftModel(DriftModel):
     worker of `vtbdrake_diagrams.forest`.
     """
 
-    along: float = setting(0.06, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)
+    along: float = setting(0.08, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)
     across: float = setting(0.12, "Standard deviation sideways, by the sway and the pointing.", unit="m/sqrt(m)", ge=0)
     heading: float = setting(0.002, "Standard deviation of the heading.", unit="rad/sqrt(s)", ge=0)
     unseen: float = setting(
-        0.15, "Standard deviation of motion that no step shows, as the first step, per axis.", unit="m/sqrt(s)", ge=0
+        0.1, "Standard deviation of motion that no step shows, as the first step, per axis.", unit="m/sqrt(s)", ge=0
     )
 
     def covariance(self, motion: ArrayLike, duration: float) -> Array:
