@@ -7,7 +7,7 @@ of images may take the place of scans (`vtbdrake_diagrams.forest.stereo`), or co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
@@ -89,6 +89,17 @@ class ScanLandmarks:
         pose = carrier_pose_at(history, time)
         p_HoLo_H = body_rotation(pose.roll, pose.pitch) @ self.X_BL.translation()
         return self.detect(points_H, self.settings, p_HoLo_H=p_HoLo_H)
+
+
+def detect_all(points_H: Array, detectors: Sequence[tuple[Callable[..., Landmarks], Any]], **place: Any) -> Landmarks:
+    """Return what several detectors find in the points of one scan, such as trunks and rocks.
+
+    Args:
+        points_H: The points in the level frame H, (n, 3) in m.
+        detectors: Each detector, such as `detect_trunks`, with its settings.
+        place: ``p_HoLo_H`` of the detectors.
+    """
+    return Landmarks.joined([detect(points_H, settings, **place) for detect, settings in detectors])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import HISTORY_LENGTH, DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.pedestrian import PedestrianDriftModel
+from vtbdrake.components.localization.rocks import RockDetectorConfig, detect_rocks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
@@ -32,17 +33,22 @@ from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.sensor_messages import image_array_map, scan_map
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
-from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer, ScanLandmarks
+from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer, ScanLandmarks, detect_all
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig, StereoLandmarks, add_stereo
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route
 from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.world.vegetation import Vegetation
+from vtbdrake_diagrams.plain.rocks import RockField
 
 if TYPE_CHECKING:
     from vtbdrake_diagrams.forest.world.driver import Driver
 
 PERCEPTIONS = ("scanner", "stereo", "both")
+LEAST_ROCK_HEIGHT = 0.1
+"""The least height over the ground of a point of a rock, in m, see `RockDetectorConfig`."""
+LANDMARKS = {"trees": ("tree",), "rocks": ("rock",), "both": ("tree", "rock")}
+"""The landmarks of the unit in a forest, and their classes in truth and map."""
 CARRIERS = ("machine", "hand", "back")
 """The carriers of the unit: a machine on wheels, or a worker on foot, in the hand or on the back."""
 
@@ -89,8 +95,8 @@ class CarrierScenario(Scenario):
     foot of the unit, is ``sim.sys.carrier.base.pose``.
     """
 
-    # The class of the landmarks in truth and map.
-    landmark: ClassVar[str]
+    # The classes of the landmarks in truth and map.
+    landmark_classes: ClassVar[tuple[str, ...]]
 
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
     seed: int = setting(0, "Determines landmarks, ground, roads, clutter and map.", ge=0)
@@ -161,6 +167,11 @@ class CarrierScenario(Scenario):
             raise ScenarioError(
                 f"{type(self).__name__}.route must be the number of one of {len(routes)} routes, not {self.route}"
             )
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The classes of the landmarks in truth and map."""
+        return self.landmark_classes
 
     @property
     def is_on_foot(self) -> bool:
@@ -272,7 +283,8 @@ class CarrierScenario(Scenario):
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         """Return the localization unit for a map, which has the errors of ``map``."""
-        landmarks, correlation = map_landmarks(world_map, self.landmark), MAPS[self.map].correlation
+        of_classes = [map_landmarks(world_map, name) for name in self.classes]
+        landmarks, correlation = Landmarks.joined(of_classes), MAPS[self.map].correlation
         x, y, z = self.X_BL.translation().tolist()
         tracker = Tracker(
             landmarks,
@@ -421,7 +433,7 @@ class ForestScenario(CarrierScenario):
     ``"both"``, the unit has scanner and cameras, and fuses what they see in one filter.
     """
 
-    landmark: ClassVar[str] = "tree"
+    landmark_classes: ClassVar[tuple[str, ...]] = ("tree",)
 
     perception: str = setting("scanner", "The sensor that detects trees, or both.", choices=PERCEPTIONS)
     # The pair of cameras.
@@ -434,11 +446,23 @@ class ForestScenario(CarrierScenario):
     undergrowth: float = setting(300.0, "Bushes per area.", unit="1/ha")
     branches: float = setting(6.0, "Dead branches per tree.")
     lean: float = setting(0.01, "Standard deviation of the inclination of trunks.", unit="rad")
+    rock_cover: float = setting(
+        0.0, "The share of the ground that rocks cover, see `RockField`; 0: none.", ge=0.0, le=0.3
+    )
+    landmarks: str = setting(
+        "trees", "The landmarks that the unit uses; rocks need a scanner with many rows.", choices=tuple(LANDMARKS)
+    )
 
     def validate(self) -> None:
         super().validate()
+        if self.landmarks != "trees" and not (self.rock_cover and self.has_scanner):
+            raise ScenarioError(
+                f"{type(self).__name__}.landmarks={self.landmarks!r} needs rocks and a scanner: rock_cover must be "
+                f"above 0, not {self.rock_cover:g}, and perception not {self.perception!r}"
+            )
         try:
             self.vegetation()
+            self.rock_field()
         except ValueError as error:
             raise ScenarioError(f"{type(self).__name__}: {error}") from None
 
@@ -458,20 +482,47 @@ class ForestScenario(CarrierScenario):
         """Return the clutter."""
         return Vegetation(self.seed, undergrowth=self.undergrowth, branches=self.branches, lean=self.lean)
 
+    def rock_field(self) -> RockField | None:
+        """Return the rocks, which leave the strip roads free; None without rocks."""
+        if not self.rock_cover:
+            return None
+        return RockField(
+            self.seed,
+            length=self.length,
+            width=self.width,
+            abundance=self.rock_cover,
+            track_width=self.road_width,
+            track_spacing=self.road_spacing,
+        )
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return LANDMARKS[self.landmarks]
+
     def routes(self) -> tuple[Route, ...]:
         return self.stand().routes()
 
     def truth(self) -> WorldModel:
-        return self.stand().trees()
+        rocks = self.rock_field()
+        return WorldModel([*self.stand().trees(), *(rocks.rocks() if rocks else ())])
 
     def surveyed_map(self, errors: MapErrors) -> WorldModel:
-        return self.stand().map(errors, seed=self.map_seed)
+        rocks = self.rock_field()
+        trees = self.stand().map(errors, seed=self.map_seed)
+        if rocks is None:
+            return trees
+        surveyed = rocks.map(errors, seed=self.map_seed)
+        return WorldModel([*trees, *(replace(rock, identity=f"rock-{rock.identity}") for rock in surveyed)])
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world.geometry import add_forest
+        from vtbdrake_diagrams.plain.geometry import add_rocks
 
         textured = self.has_stereo
         add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
+        rocks = self.rock_field()
+        if rocks is not None:
+            add_rocks(plant, rocks.rocks(), self.ground())
 
     @property
     def has_scanner(self) -> bool:
@@ -504,7 +555,23 @@ class ForestScenario(CarrierScenario):
         return signals
 
     def detector(self) -> ScanLandmarks:
-        return ScanLandmarks(detect_trunks, TrunkDetectorConfig(**self.scanner_accuracy()), self.X_BL)
+        detectors = [self.detector_of(name) for name in self.classes]
+        if len(detectors) == 1:
+            return detectors[0]
+        return ScanLandmarks(detect_all, [(each.detect, each.settings) for each in detectors], self.X_BL)
+
+    def detector_of(self, name: str) -> ScanLandmarks:
+        """Return the detector of landmarks of one class in scans.
+
+        Args:
+            name: The class, ``tree`` or ``rock``.
+        """
+        accuracy = self.scanner_accuracy()
+        if name == "rock":
+            return ScanLandmarks(
+                detect_rocks, RockDetectorConfig(**accuracy, least_height=LEAST_ROCK_HEIGHT), self.X_BL
+            )
+        return ScanLandmarks(detect_trunks, TrunkDetectorConfig(**accuracy), self.X_BL)
 
     def sensors(self) -> tuple[LandmarkSensor, ...]:
         scanner = super().sensors() if self.has_scanner else ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
+from vtbdrake.components.world_model import WorldModel
 from vtbdrake_diagrams.forest.world.geometry import add_ground, add_surface
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.plain.rocks import RockField, rock_surface
@@ -23,6 +24,16 @@ def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> N
         ground: The ground.
     """
     add_ground(plant, ground, length=rock_field.length, width=rock_field.width, color=_SAND)
-    rocks = rock_field.rocks()
+    add_rocks(plant, rock_field.rocks(), ground)
+
+
+def add_rocks(plant: MultibodyPlant, rocks: WorldModel, ground: Ground) -> None:
+    """Register rocks on their ground, like `add_plain`.
+
+    Args:
+        plant: A plant that is registered with a SceneGraph, and not finalized.
+        rocks: The rocks, with the attributes of `RockField.rocks`.
+        ground: The ground.
+    """
     if len(rocks):
         add_surface(plant, "rocks", rock_surface(rocks, ground), _STONE)

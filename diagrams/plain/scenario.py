@@ -13,7 +13,7 @@ from vtbdrake.components.localization.rocks import RockDetectorConfig, detect_ro
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake_diagrams.forest.perception import ScanLandmarks
-from vtbdrake_diagrams.forest.scenario import CarrierScenario
+from vtbdrake_diagrams.forest.scenario import LEAST_ROCK_HEIGHT, CarrierScenario
 from vtbdrake_diagrams.forest.world.routes import Route
 from vtbdrake_diagrams.forest.world.stand import MapErrors
 from vtbdrake_diagrams.plain.rocks import RockField
@@ -36,7 +36,7 @@ def scanner_config() -> LaserScannerConfig:
 class PlainScenario(CarrierScenario):
     """A carrier on a rock-strewn plain of Mars with cleared tracks; the landmarks are rocks."""
 
-    landmark: ClassVar[str] = "rock"
+    landmark_classes: ClassVar[tuple[str, ...]] = ("rock",)
 
     gravity: float = 3.71
     relief: float = 0.5
@@ -69,7 +69,9 @@ class PlainScenario(CarrierScenario):
         return self.rock_field().map(errors, seed=self.map_seed)
 
     def detector(self) -> ScanLandmarks:
-        return ScanLandmarks(detect_rocks, RockDetectorConfig(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
+        return ScanLandmarks(
+            detect_rocks, RockDetectorConfig(**self.scanner_accuracy(), least_height=LEAST_ROCK_HEIGHT), self.X_BL
+        )
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.plain.geometry import add_plain

@@ -222,19 +222,21 @@ def simulated_drive(
     )
 
 
-def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
+def recorded_drive(scenario: CarrierScenario, *, length: float, detectors: Sequence[LandmarkSensor] = ()) -> Drive:
     """Simulate a carrier that stands at first, and return what its DPS detects in each sample, and its odometry.
 
     Args:
         scenario: The carrier in its world; its map does not matter.
         length: The length of the drive in m.
+        detectors: What detects landmarks in the scans instead of the unit's sensors, each in a view of its own.
 
     Raises:
         RuntimeError: The drive takes more than twice the time that it should.
     """
     testbed = scenario.build()
     pose, history = (testbed.reader(address) for address in (_POSE, _HISTORY))
-    sensors = [_SensorReader.of(testbed, sensor) for sensor in scenario.sensors()]
+    sensors = [_SensorReader.of(testbed, sensor) for sensor in detectors or scenario.sensors()]
+    periods = scenario.perception_periods[:1] * len(detectors) if detectors else scenario.perception_periods
     simulator = testbed.simulator()
     context = simulator.get_mutable_context()
     testbed.write(context, {_SPEED: 0.0})
@@ -242,7 +244,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     rows: list[tuple[float, Array, Array, Array]] = []
     views: list[Views] = []
     travelled = 0.0
-    for due, shown in _due(scenario.perception_periods):
+    for due, shown in _due(periods):
         if travelled >= length:
             break
         if due > limit:

@@ -23,6 +23,9 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
 from vtbdrake.components.localization.scan_scene import Cells, Clusters, ScanDetectorConfig, ScanPoints
 
+# What goes on to this height in m above the largest one of a rock is connected with the ground, as a trunk.
+_OVERHEAD = 0.5
+
 
 @dataclass(frozen=True)
 class RockDetectorConfig(ScanDetectorConfig):
@@ -36,6 +39,12 @@ class RockDetectorConfig(ScanDetectorConfig):
         0.06,
         "The least height over the ground of a point of a rock; more than the height of waves of the ground that "
         "are too short for `fit_ground` to follow.",
+        unit="m",
+        gt=0.0,
+    )
+    largest_height: float = setting(
+        1.5,
+        "The largest height over the ground of a point of a rock: what reaches above it, as a trunk, is none.",
         unit="m",
         gt=0.0,
     )
@@ -74,7 +83,9 @@ def detect_rocks(points_H: ArrayLike, detector: RockDetectorConfig, *, p_HoLo_H:
         ValueError: The points have another shape, or are not finite.
     """
     scene = ScanPoints.of(points_H, p_HoLo_H, detector)
-    standing = scene.select(np.flatnonzero(scene.heights > detector.least_height))
+    # What hangs over a rock, as branches, is no part of it.
+    is_low = scene.heights < detector.largest_height + _OVERHEAD
+    standing = scene.select(np.flatnonzero((scene.heights > detector.least_height) & is_low))
     cells = Cells.of(standing.points, size=detector.cell, reach=detector.reach)
     rows, owners = cells.connected(np.arange(len(standing)))
     if not len(rows):
@@ -97,7 +108,8 @@ def _outlines(clusters: Clusters, detector: RockDetectorConfig, origin: Array) -
     variance = clusters.sums(centred**2) / clusters.counts + (step * mean) ** 2 / 12.0
     width, distance = 2.0 * radius, mean + 0.25 * pi * np.sqrt(3.0 * variance)
     hidden = clusters.hidden_edges(detector, gap=detector.cell + 4.0 * detector.range_noise)
-    good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1)
+    heights = np.maximum.reduceat(clusters.scene.heights[clusters.rows], starts)
+    good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1) & (heights < detector.largest_height)
     good &= (width >= detector.least_width) & (width <= detector.largest_width)
     # The distance of the sides beyond the middle, as a share of a circle's distance.
     middle, half = 0.5 * (left + right), 0.5 * (left - right + step)
