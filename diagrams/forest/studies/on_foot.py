@@ -66,11 +66,12 @@ FILE = Path(__file__).with_suffix(".json")
 
 
 @dataclass(frozen=True)
-class Walk:
+class Way:
     """The results of one way with one map.
 
     Attributes:
-        carrier, map: Their names.
+        variant: The carrier, or another name of what is compared.
+        map: The name of the map.
         rms: RMS error of the position in m, over the scans with a pose; None without a pose.
         heading: RMS error of the heading in rad; None without a pose.
         reckoned: RMS error of the position in m by dead reckoning alone, at the same scans; None without a pose.
@@ -84,7 +85,7 @@ class Walk:
         tilt: RMS error of roll and of pitch by the dead reckoning, in rad.
     """
 
-    carrier: str
+    variant: str
     map: str
     rms: float | None
     heading: float | None
@@ -99,7 +100,7 @@ class Walk:
     tilt: tuple[float, float]
 
 
-Walks = Mapping[int, Sequence[Walk]]
+Ways = Mapping[int, Sequence[Way]]
 """The results by the seed of the forest."""
 
 
@@ -112,7 +113,7 @@ def carried(seed: int, carrier: str) -> ForestScenario:
     return replace(scenario, carrier=carrier, speed=WALK, step_frequency=frequency, scanner_height=HEIGHTS[carrier])
 
 
-def walked(seed: int, *, length: float = LENGTH, carriers: Sequence[str] = CARRIERS) -> list[Walk]:
+def walked(seed: int, *, length: float = LENGTH, carriers: Sequence[str] = CARRIERS) -> list[Way]:
     """Return the results in the forest of a seed.
 
     Args:
@@ -120,7 +121,7 @@ def walked(seed: int, *, length: float = LENGTH, carriers: Sequence[str] = CARRI
         length: The length of the way in m.
         carriers: The carriers of the unit.
     """
-    walks = []
+    ways = []
     # One thread: matrices are small, and threads that wait for each other take most of the time.
     with threadpool_limits(1):
         for carrier in carriers:
@@ -128,19 +129,25 @@ def walked(seed: int, *, length: float = LENGTH, carriers: Sequence[str] = CARRI
             drive = recorded_drive(scenario, length=length)
             for name in MAP_NAMES:
                 surveyed = replace(scenario, map=name)
-                walks.append(judged(localize(drive, surveyed.unit(surveyed.global_map())), carrier, name))
-    return walks
+                ways.append(judged(localize(drive, surveyed.unit(surveyed.global_map())), carrier, name))
+    return ways
 
 
-def judged(track: Track, carrier: str, name: str) -> Walk:
-    """Return the results of one way with a map of this name."""
+def judged(track: Track, variant: str, name: str) -> Way:
+    """Return the results of one way.
+
+    Args:
+        track: The answers of the unit.
+        variant: The name of what is compared.
+        name: The name of the map.
+    """
     drive, errors, nees = track.drive, track.errors, track.nees
     distances, has_pose = np.hypot(*errors[:, :2].T), bool(len(errors))
     off = _reckoning_errors(track)
     roll, pitch = (rms(angles) for angles in drive.tilts.T)
     way = drive.travelled[-1] - drive.travelled[track.is_localized][0] if has_pose else 0.0
-    return Walk(
-        carrier=carrier,
+    return Way(
+        variant=variant,
         map=name,
         rms=rms(distances) if has_pose else None,
         heading=rms(errors[:, 2]) if has_pose else None,
@@ -167,8 +174,8 @@ def _reckoning_errors(track: Track) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class WalkSummary:
-    """The results over all forests, of one carrier with one map.
+class WaySummary:
+    """The results over all forests, of one variant with one map.
 
     Attributes:
         rms: RMS error of the position in m, over all scans with a pose.
@@ -202,9 +209,9 @@ class WalkSummary:
         return is_accurate and self.localized >= LEAST_LOCALIZED and not self.wrong and self.last_nees <= self.bounds[1]
 
 
-def summary(walks: Walks, carrier: str, name: str) -> WalkSummary:
-    """Return the results over all forests of a carrier with a map of this name."""
-    cases = [walk for of in walks.values() for walk in of if (walk.carrier, walk.map) == (carrier, name)]
+def summary(ways: Ways, variant: str, name: str) -> WaySummary:
+    """Return the results over all forests of a variant with a map of this name."""
+    cases = [way for of in ways.values() for way in of if (way.variant, way.map) == (variant, name)]
     located = [case for case in cases if case.poses]
     weights = np.array([case.poses for case in located])
 
@@ -212,7 +219,7 @@ def summary(walks: Walks, carrier: str, name: str) -> WalkSummary:
         values = np.array([getattr(case, of) for case in located]) ** power
         return float((weights * values).sum() / weights.sum()) ** (1.0 / power) if len(located) else np.nan
 
-    return WalkSummary(
+    return WaySummary(
         rms=mean("rms", 2),
         heading=mean("heading", 2),
         reckoned=mean("reckoned", 2),
@@ -227,22 +234,27 @@ def summary(walks: Walks, carrier: str, name: str) -> WalkSummary:
     )
 
 
-def holds(walks: Walks) -> bool:
+def holds(ways: Ways) -> bool:
     """Return whether the criteria hold for the unit in the hand and on the back, with both maps."""
     on_foot = [carrier for carrier in CARRIERS if carrier != "machine"]
-    return all(summary(walks, carrier, name).holds(name) for carrier, name in product(on_foot, MAP_NAMES))
+    return all(summary(ways, carrier, name).holds(name) for carrier, name in product(on_foot, MAP_NAMES))
 
 
-def report(walks: Walks) -> str:
-    """Return the table of the results, and whether the criteria hold."""
-    header = ("carrier", "map", "RMSE m", "deg", "reckoned m", "astray", "localized", "lost", "wrong")
+def report(ways: Ways, variants: Sequence[str] = CARRIERS) -> str:
+    """Return the table of the results.
+
+    Args:
+        ways: The results.
+        variants: The names of what is compared, in the order of the rows.
+    """
+    header = ("unit", "map", "RMSE m", "deg", "reckoned m", "astray", "localized", "lost", "wrong")
     header = (*header, "NEES", "of last", "95 %", "tilt mrad", "holds")
     rows = []
-    for carrier, name in product(CARRIERS, MAP_NAMES):
-        each = summary(walks, carrier, name)
+    for variant, name in product(variants, MAP_NAMES):
+        each = summary(ways, variant, name)
         rows.append(
             (
-                carrier,
+                variant,
                 name,
                 f"{each.rms:.3f}",
                 f"{np.degrees(each.heading):.2f}",
@@ -258,41 +270,44 @@ def report(walks: Walks) -> str:
                 "yes" if each.holds(name) else "NO",
             )
         )
-    return f"{table(header, rows)}\n{len(walks)} forests, {LENGTH:g} m each; on foot: {_word(holds(walks))}"
+    return f"{table(header, rows)}\n{len(ways)} forests"
 
 
 def _word(is_true: bool) -> str:
     return "holds" if is_true else "does NOT hold"
 
 
-def in_words(walks: Walks) -> str:
+def in_words(ways: Ways) -> str:
     """Return how the unit does on foot, in a few sentences."""
     parts = []
     for carrier in ("hand", "back"):
-        each = [summary(walks, carrier, name) for name in MAP_NAMES]
+        each = [summary(ways, carrier, name) for name in MAP_NAMES]
         errors = ", ".join(f"{of.rms:.3f} m with the {name} map" for of, name in zip(each, MAP_NAMES, strict=True))
         parts.append(
             f"{'in the hand' if carrier == 'hand' else 'on the back'} {errors}, a pose in "
             f"{min(of.localized for of in each):.0%}, {sum(of.wrong for of in each)} wrong claims"
         )
-    machine = ", ".join(f"{summary(walks, 'machine', name).rms:.3f} m" for name in MAP_NAMES)
-    reckoned = summary(walks, "hand", "accurate").reckoned
+    machine = ", ".join(f"{summary(ways, 'machine', name).rms:.3f} m" for name in MAP_NAMES)
+    reckoned = summary(ways, "hand", "accurate").reckoned
     return (
-        f"Carried by a worker on foot through {len(walks)} other forests it errs by (RMS) {'; '.join(parts)}. Dead "
+        f"Carried by a worker on foot through {len(ways)} other forests it errs by (RMS) {'; '.join(parts)}. Dead "
         f"reckoning by steps alone errs by {reckoned:.2f} m, the machine in the same forests by {machine}. The "
-        f"criteria on foot: {_word(holds(walks))}."
+        f"criteria on foot: {_word(holds(ways))}."
     )
 
 
-def load() -> dict[int, list[Walk]]:
-    """Return the results that are kept in `FILE`.
+def load(file: Path = FILE) -> dict[int, list[Way]]:
+    """Return the results that are kept in a file.
+
+    Args:
+        file: The file, by default `FILE`.
 
     Raises:
         KeptResultsError: It is missing, or was changed.
     """
     return {
-        int(seed): [Walk(**{**walk, "tilt": tuple(walk["tilt"])}) for walk in walks]
-        for seed, walks in read_results(FILE).items()
+        int(seed): [Way(**{**way, "tilt": tuple(way["tilt"])}) for way in ways]
+        for seed, ways in read_results(file).items()
     }
 
 
@@ -303,11 +318,12 @@ def main(forests: int, workers: int) -> None:
     """Go through the forests that the file lacks, and print the table of all."""
     results = load() if FILE.exists() else {}
     seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
-    for seed, walks in in_processes(walked, seeds, workers=workers):
-        results[seed] = walks
+    for seed, ways in in_processes(walked, seeds, workers=workers):
+        results[seed] = ways
         write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.on_foot")
         print(f"{len(results)} forests", flush=True)
     print(report(results))
+    print(f"on foot: {_word(holds(results))}")
 
 
 if __name__ == "__main__":
