@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Diagram, OutputPort, System
+from pydrake.systems.framework import Diagram, System
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.scan import Scan
@@ -349,8 +349,9 @@ class CarrierScenario(Scenario):
         plant.SetDefaultFloatingBaseBodyPose(base, X_WB)
         plant.Finalize()
         wheels = builder.add("act", "wheels", Wheels(plant, base, carrier, ground))
-        state = plant.get_state_output_port()
-        driver = self._add_driver(builder, state, start=base.floating_positions_start(), wheel_base=carrier.wheel_base)
+        size, start = plant.num_multibody_states(), base.floating_positions_start()
+        driver = self._add_driver(builder, size=size, start=start, wheel_base=carrier.wheel_base)
+        builder.connect(plant.get_state_output_port(), driver.GetInputPort("state"))
         self._connect_motion(builder, wheels, driver)
         self._add_imu(builder, base)
         odometer = WheelOdometer(period=PERIOD, scale=self.odometry_scale, errors=self.odometry_errors)
@@ -363,7 +364,7 @@ class CarrierScenario(Scenario):
     def _add_worker(self, builder: VirtualTestbedBuilder, *, position: Array, heading: float) -> None:
         """Add the worker who carries the unit along the route, and what is believed of both."""
         from vtbdrake_diagrams.forest.belief import declare_belief_on_foot
-        from vtbdrake_diagrams.forest.world.worker import Legs, Worker, add_worker
+        from vtbdrake_diagrams.forest.world.worker import WALKER, Legs, Worker, add_worker
 
         plant, ground = builder.plant, self.ground()
         worker = Worker.carrying(self.carrier, height=self.scanner_height, step_frequency=self.step_frequency)
@@ -372,7 +373,8 @@ class CarrierScenario(Scenario):
         legs = Legs(plant, base, worker, ground, position=position, heading=heading, seed=self.seed)
         plant.SetDefaultFloatingBaseBodyPose(base, legs.unit_pose(position, heading, 0.0, 0.0, time=0.0))
         builder.add("act", "legs", legs)
-        driver = self._add_driver(builder, legs.GetOutputPort("walker"), start=0, wheel_base=0.0)
+        driver = self._add_driver(builder, size=WALKER, start=0, wheel_base=0.0)
+        builder.connect(legs.GetOutputPort("walker"), driver.GetInputPort("state"))
         self._connect_motion(builder, legs, driver)
         self._add_imu(builder, base)
         declare_belief_on_foot(builder, worker, ground, self.routes(), age=PERIOD)
@@ -380,16 +382,14 @@ class CarrierScenario(Scenario):
     def _add_imu(self, builder: VirtualTestbedBuilder, base: RigidBody) -> None:
         builder.add_sensor("imu", Imu(builder.plant, base.body_frame(), period=PERIOD, errors=self.imu_errors))
 
-    def _add_driver(
-        self, builder: VirtualTestbedBuilder, state: OutputPort, *, start: int, wheel_base: float
-    ) -> Driver:
-        """Add the driver, who sees a pose in a port from ``start`` on, and return it."""
+    def _add_driver(self, builder: VirtualTestbedBuilder, *, size: int, start: int, wheel_base: float) -> Driver:
+        """Add the driver and return it, see `Driver`; its port ``state`` is still to be connected."""
         from vtbdrake_diagrams.forest.world.driver import Driver
 
         routes = self.routes()
         driver = Driver(
             routes,
-            size=state.size(),
+            size=size,
             start=start,
             wheel_base=wheel_base,
             period=PERIOD,
@@ -399,7 +399,6 @@ class CarrierScenario(Scenario):
             along=self.start % routes[self.route].length,
         )
         builder.add("act", "driver", driver)
-        builder.connect(state, driver.GetInputPort("state"))
         builder.sim_actuator("route", driver.GetInputPort("route"))
         return driver
 

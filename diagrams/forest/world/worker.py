@@ -44,6 +44,9 @@ from vtbdrake_diagrams.forest.world.ground import Ground
 PLACES = {"hand": 0.45, "back": -0.25}
 """Where a worker carries the unit, and how far it is in front of the middle of the body there, in m."""
 
+WALKER = 7
+"""The size of the port ``walker`` of `Legs`: quaternion and position."""
+
 # The speed in m/s for which the gait is published.
 _PUBLISHED_SPEED = 1.2
 # The number of sines of the wander, and the range of their periods in s.
@@ -194,7 +197,7 @@ class Legs(AddressedSystem):
             "spatial_force", lambda: Value([ExternallyAppliedSpatialForce()]), self._calc_force
         )
         self.DeclareVectorOutputPort(
-            "walker", 7, self._calc_walker, prerequisites_of_calc={self.discrete_state_ticket(self._walk.index)}
+            "walker", WALKER, self._calc_walker, prerequisites_of_calc={self.discrete_state_ticket(self._walk.index)}
         )
         self.DeclarePeriodicDiscreteUpdateEvent(self._step, 0.0, self._update)
 
