@@ -4,7 +4,7 @@
 with rocks that cover 3 to 10 % of the ground (`drives.ABUNDANCES`). The scanner is the one for rocks, with 64 rows.
 Both detectors work on the same scans, of the whole world: trunks, bushes and branches may be taken for rocks. From what
 they detect, the unit is localized three times, with a map of the trees, of the rocks, and of both; one filter takes
-both as landmarks, and does not use of which kind one is, but its diameter. What is in `FILE` is not driven again.
+both as landmarks, and uses their diameters, not their kinds. What is in `FILE` is not driven again.
 
 The criteria, fixed before any of the forests from `SEED` on was driven (nothing was tuned; forests 300,000, 300,001 and
 300,020 were looked at): over all forests, with each map and each kind, the ones of `on_foot` but for dead reckoning: a

@@ -226,9 +226,9 @@ class Legs(AddressedSystem):
 
     def _next(self, context: Context) -> tuple[Array, float, float, float]:
         """Return position, heading, speed and phase one step later."""
-        walk, (wanted, curvature) = self._walk.view(context), self._controls.Eval(context).tolist()
+        walk, (target_speed, curvature) = self._walk.view(context), self._controls.Eval(context).tolist()
         T, most = self._step, self._worker.acceleration * self._step
-        speed = walk.speed + min(max(wanted - walk.speed, -most), most)
+        speed = walk.speed + min(max(target_speed - walk.speed, -most), most)
         heading = walk.heading + T * speed * curvature
         middle = 0.5 * (walk.heading + heading)
         position = walk.position + T * speed * np.array([cos(middle), sin(middle)])

@@ -123,3 +123,17 @@ def test_bad_input_is_rejected():
         detect_rocks(np.full((3, 3), np.inf), RockDetectorConfig(), p_HoLo_H=EYE)
     with pytest.raises(ValueError, match="least_points must be a whole number of at least 2, not 1"):
         RockDetectorConfig(least_points=1)
+
+
+def test_trunks_and_what_hangs_over_a_rock_are_no_rocks():
+    trunks, rocks = np.array([[6.0, 0.0], [0.0, 9.0]]), np.array([[-7.0, 0.5], [0.5, -8.0]])
+    shapes = [[*place, 0.0, 0.5, 0.5, 0.6, 0.0] for place in rocks]
+    # A bough over the second rock.
+    shapes.append([*rocks[1], 2.6, 0.5, 0.5, 0.3, 0.0])
+    scene = Scene(trunks, np.array([0.4, 0.5]), ellipsoids=np.array(shapes))
+    found = seen(scene)[0].positions
+    assert len(found) == 2
+    which, _ = pairs(found, rocks, within=0.3)
+    assert len(which) == 2
+    # Without a limit of the height, the trunks are taken for rocks.
+    assert len(seen(scene, RockDetectorConfig(least_height=0.2, largest_height=100.0))[0]) > 2

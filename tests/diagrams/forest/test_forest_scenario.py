@@ -298,6 +298,9 @@ def test_positions_in_a_file_are_not_taken_as_exact(tmp_path: Path) -> None:
         ({"length": 20.0}, "a stand with roads is at least 40 m long"),
         ({"bumps": 1.0}, "bumps must be a number from 0 to 0.08 m, not 1.0: a carrier must drive there"),
         ({"undergrowth": -1.0}, "undergrowth must be a number from 0 to 5000 1/ha, not -1.0"),
+        ({"landmarks": "rocks"}, "needs rocks and a scanner: rock_cover must be above 0, not 0"),
+        ({"rock_cover": 0.5}, "rock_cover must be a number from 0 to 0.3, not 0.5"),
+        ({"carrier": "foot"}, "carrier must be one of"),
         ({"lean": 0.5}, "lean must be a number from 0 to 0.2 rad, not 0.5"),
         ({"laps": 0}, "laps must be a whole number of at least 1"),
         ({"scanner": LaserScannerConfig(frequency=0.0)}, "scanner.frequency must be a finite number above 0 Hz"),
@@ -316,3 +319,19 @@ def test_testbed_is_freed() -> None:
     del testbed
     gc.collect()
     assert left() is None
+
+
+def test_forest_with_rocks_has_them_in_truth_map_and_landmarks() -> None:
+    scenario = ForestScenario(seed=2, length=40.0, width=40.0, rock_cover=0.05, landmarks="both")
+    truth, surveyed = scenario.truth(), scenario.global_map()
+    rocks, trees = truth.find("rock"), truth.find("tree")
+    assert len(rocks) > 20 and len(trees) > 20
+    assert len(surveyed.find("rock")) == len(rocks) and len(surveyed.find("tree")) == len(trees)
+    counts = {
+        kinds: len(replace(scenario, landmarks=kinds).unit(surveyed).tracker.landmarks)
+        for kinds in ("trees", "rocks", "both")
+    }
+    assert counts == {"trees": len(trees), "rocks": len(rocks), "both": len(trees) + len(rocks)}
+    # The roads are free.
+    gaps = [route.distances(np.array([rock.p_WoOo_W[:2] for rock in rocks])).min() for route in scenario.routes()]
+    assert min(gaps) > 2.0

@@ -31,8 +31,8 @@ def written_back(
     Landmarks that are gone are retired. Moved ones are revised: they have the position, the covariance and the diameter
     by the drive. Added ones are new objects ``<class>#<number>`` that are confirmed. A drive shows where these are and
     how wide: their height over the ground of the model is the one of the nearest object of the map, with an infinite
-    variance, and their other lengths, such as the height of a tree, are those of the object of the most similar
-    diameter.
+    variance, and their other lengths, such as the height of a tree, are taken from the object of the most
+    similar diameter.
 
     The errors of the landmarks are correlated in the filter, with each other and with the map. A world model has no
     such correlations: do not fuse the result with further observations of the same drive.
@@ -47,7 +47,7 @@ def written_back(
     Raises:
         ValueError: The changes are of another map: they name landmarks that the model does not have.
     """
-    mapped = [found for found in model.find(kind) if found.is_known]
+    mapped = [landmark for landmark in model.find(kind) if landmark.is_known]
     named = [*changes.gone.tolist(), *changes.origins.tolist()]
     if named and max(named) >= len(mapped):
         raise ValueError(
@@ -72,8 +72,8 @@ def written_back(
 def _added(
     landmarks: Landmarks, row: int, identity: str, kind: str, mapped: list[WorldObject], *, time: float, source: str
 ) -> WorldObject:
-    places = np.array([found.p_WoOo_W for found in mapped])
-    diameters = np.array([found.number(DIAMETERS[kind], unit="m") for found in mapped])
+    places = np.array([landmark.p_WoOo_W for landmark in mapped])
+    diameters = np.array([landmark.number(DIAMETERS[kind], unit="m") for landmark in mapped])
     nearest = int(np.argmin(np.hypot(*(places[:, :2] - landmarks.positions[row]).T)))
     similar = mapped[int(np.argmin(np.abs(diameters - landmarks.diameters[row])))]
     lengths = {
@@ -95,5 +95,5 @@ def _pose(landmarks: Landmarks, row: int, *, height: float, variance: float, tim
 
 def _diameter(landmarks: Landmarks, row: int, kind: str) -> Mapping[str, AttributeValue]:
     deviation = float(landmarks.diameter_deviations[row])
-    known = deviation if np.isfinite(deviation) else 0.0
-    return {DIAMETERS[kind]: AttributeValue(float(landmarks.diameters[row]), "m", known)}
+    finite = deviation if np.isfinite(deviation) else 0.0
+    return {DIAMETERS[kind]: AttributeValue(float(landmarks.diameters[row]), "m", finite)}
