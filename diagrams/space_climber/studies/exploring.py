@@ -11,6 +11,8 @@ decides.
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -70,6 +72,10 @@ LATENCY = 3.0
 # Places of a leg that are kept, and the number of segments in which a robot that is not blocked gets on.
 _PLACES = round(LEG / SEGMENT) + 1
 _WITHIN = round(BLOCKED_WITHIN / SEGMENT)
+# The niceness of the process in which ``head`` works beside a loop.
+_NICENESS = 5
+# All heads of a process have one mental world, which each decision puts elsewhere.
+_taking_turns = threading.Lock()
 # Times that differ by less are equal, in s.
 _ROUNDING = 1e-6
 
@@ -197,7 +203,8 @@ class Head:
     """
 
     def prepare(self) -> None:
-        """Compile the mental world before the first decision."""
+        """Compile the mental world before the first decision, in a process that leaves the processors to the loop."""
+        os.nice(_NICENESS)
         reasoner, *_ = mental_reasoner()
         reasoner.warm_up()
 
@@ -218,7 +225,8 @@ class Head:
         places, blocked, obstacle, stepped = int(leg[0]), leg[1], leg[2:4], float(leg[4])
         if places > 1:
             explorer.felt(list(leg[5:].reshape(-1, 2)[:places]), stepped, blocked_by=obstacle if blocked else None)
-        stop = explorer.decide(_SampledRover(reasoner.problem.testbed, dps, scan))
+        with _taking_turns:
+            stop = explorer.decide(_SampledRover(reasoner.problem.testbed, dps, scan))
         goes = stop.heading is not None
         gains = [gain for heading, walk, gain in stop.tried if (heading, walk) == (stop.heading, stop.walk)]
         outputs = {

@@ -165,7 +165,10 @@ def test_dps_decides_in_drake_and_on_a_machine_as_the_judged_robot_does() -> Non
     testbed, dps = scenario.build(), DpsAlone(scenario)
     simulated, own = testbed.default_context(), dps.default_context()
     end = LOOKING + PERIOD + LATENCY + 4.0
-    testbed.simulator(simulated).AdvanceTo(end)
+    simulator = testbed.simulator(simulated)
+    simulator.AdvanceTo(LOOKING + 2.0 * PERIOD)
+    in_between = testbed.snapshot(simulated)
+    simulator.AdvanceTo(end)
     deployment = Deployment.of(scenario).in_lock_step("joint_encoders")
     with (
         Hub(port=0) as hub,
@@ -183,3 +186,9 @@ def test_dps_decides_in_drake_and_on_a_machine_as_the_judged_robot_does() -> Non
     np.testing.assert_allclose(decided[1], decided[0], atol=1e-6)
     assert gains[1] == pytest.approx(gains[0], abs=0.05) and gains[0] > 3.0
     assert testbed.read(simulated, "dps.impl.navigator.position")[0] > 0.3  # It walks.
+    # What is saved while it thinks goes on alike elsewhere.
+    other = scenario.build()
+    restored = other.default_context()
+    other.restore(restored, in_between)
+    other.simulator(restored, restored=True).AdvanceTo(end)
+    assert not other.snapshot(restored).compare(testbed.snapshot(simulated))
