@@ -48,7 +48,7 @@ from scipy.spatial import Delaunay
 from scipy.special import ndtr
 
 from vtbdrake.common.arrays import Array
-from vtbdrake.components.meshes import obj_mesh
+from vtbdrake.components.meshes import obj_mesh, surface_mesh
 
 RIM_RADIUS = 40.0
 DEPTH = 6.0
@@ -302,7 +302,7 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
     world, default = plant.world_body(), ProximityProperties()
     vertices, triangles = crater.mesh
     plant.RegisterVisualGeometry(
-        world, RigidTransform(), Mesh(obj_mesh(vertices, triangles, name="terrain"), 1.0), "ground", GREY
+        world, RigidTransform(), Mesh(surface_mesh((vertices, triangles), name="terrain"), 1.0), "ground", GREY
     )
     for name, shape, X_WS in crater_shapes(crater):
         plant.RegisterCollisionGeometry(world, X_WS, shape, name, default)

@@ -15,13 +15,15 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any
 
 import click
 import numpy as np
 from drake import lcmt_scope
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues
 from scipy import sparse
 
@@ -49,6 +51,7 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     LEG,
     LONGEST,
     LOOKING,
+    ROCK_COVER,
     SEGMENT,
     Explorer,
     Rover,
@@ -282,12 +285,19 @@ def _decode(arrays: Mapping[str, Array]) -> BelievedTerrain:
 TERRAIN_CODEC = Codec(_encode, _decode)
 
 
+def _plant_config() -> MultibodyPlantConfig:
+    return true_world(0).plant_config
+
+
 @dataclass
 class ExploringScenario(CraterScenario):
-    """The robot that finds its way out of a `CraterScenario` when ``u.explore`` is 1; it has a survey, and looks."""
+    """A six-legged robot that finds its way out of a `Crater`: it looks around, tries headings in mind, and walks."""
 
+    # Discrete steps, as in the worlds of `perceived`.
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
+    plant_config: MultibodyPlantConfig = field(default_factory=_plant_config)
+    rock_cover: float = ROCK_COVER
     scans: bool = True
-    boulders: bool = True
 
     @classmethod
     def in_world(cls, world: CraterScenario) -> ExploringScenario:
