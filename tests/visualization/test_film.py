@@ -113,6 +113,17 @@ def test_command_line_films_a_rollout(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["crater", "quadruped", "station"])
+def test_examples_with_meshes_can_be_filmed(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "film.gif"
+    arguments = ["rollout", name, "--horizon", "0.1", "--film", str(path)]
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    with Image.open(path) as film:
+        assert len(film.convert("RGB").getcolors(10**6) or ()) > 10  # Something is shaded.
+
+
+@pytest.mark.slow
 def test_command_line_films_a_replay(tmp_path: Path) -> None:
     log, path, columns = tmp_path / "pole.lcm", tmp_path / "film.gif", tmp_path / "angle.csv"
     config = MachineConfig(values={"sim.sys.cart_pole.pole_pin.position": 1.2})
