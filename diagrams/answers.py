@@ -21,7 +21,7 @@ from vtbdrake_diagrams.tables import Crash, Registry, run, selected_names, write
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
     "O1": "vtbdrake_diagrams.satellite.studies.mount:mount",
-    "O2": "vtbdrake_diagrams.satellite.studies.scan_frequency:frequency",
+    "O2": "vtbdrake_diagrams.satellite.studies.scan_answer:frequency",
     "O3": "vtbdrake_diagrams.satellite.studies.lighting:lighting",
     "O4": "vtbdrake_diagrams.space_climber.studies.answers:payload",
     "R1": "vtbdrake_diagrams.space_climber.studies.answers:heading",

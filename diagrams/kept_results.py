@@ -1,18 +1,31 @@
 """Results of long campaigns, kept in files beside their studies: what they are, the command that makes them, a digest.
 
-A row of the answers reads them, simulates a few of the cases again, and compares.
+A row of the answers reads them, makes a tenth of them again, drawn at random, and compares: see `repeat`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from vtbdrake.common.json_data import plain
 from vtbdrake.state.archive import whole_file
+from vtbdrake_diagrams.processes import in_processes
+
+SHARE = 0.1
+"""The share of the kept results that a row of the answers makes again."""
+
+_Case = TypeVar("_Case")
+_Result = TypeVar("_Result")
 
 
 class KeptResultsError(ValueError):
@@ -52,3 +65,61 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def _digest(results: Any) -> str:
     return hashlib.sha256(json.dumps(results, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """Kept results that were made again.
+
+    Attributes:
+        kind: What they are results of, in the plural: "captures".
+        kept: The number of kept results.
+        count: The number of results that were made again.
+        seed: The seed by which these were drawn.
+        different: The cases whose result is another one now, in words.
+    """
+
+    kind: str
+    kept: int
+    count: int
+    seed: int
+    different: tuple[str, ...]
+
+    @property
+    def same(self) -> bool:
+        """Return whether all results came out as they are kept."""
+        return not self.different
+
+    def __str__(self) -> str:
+        outcome = "as kept" if self.same else f"OTHERS than kept: {'; '.join(self.different)}"
+        return f"{self.count} of {self.kept} kept {self.kind} simulated again (drawn by seed {self.seed}): {outcome}"
+
+
+def repeat(
+    kind: str,
+    kept: Mapping[_Case, _Result],
+    function: Callable[[_Case], _Result],
+    agree: Callable[[_Result, _Result], bool],
+    *,
+    share: float = SHARE,
+    seed: int | None = None,
+    workers: int | None = None,
+) -> Repetition:
+    """Make a random share of some kept results again, in processes, and compare.
+
+    Args:
+        kind: What they are results of, in the plural.
+        kept: The results by case; a case in words is its text.
+        function: A function of a module that makes the result of a case.
+        agree: Returns whether a kept result and a new one are the same, but for rounding on another processor.
+        share: The share of the cases that is drawn; at least one case is.
+        seed: The seed of the draw; None draws the seed, too.
+        workers: The number of processes, see `in_processes`.
+    """
+    seed = secrets.randbelow(2**32) if seed is None else seed
+    cases = list(kept)
+    numbers = np.random.default_rng(seed).choice(len(cases), ceil(share * len(cases)), replace=False)
+    drawn = [cases[number] for number in sorted(numbers.tolist())]
+    again = in_processes(function, drawn, workers=workers)
+    different = tuple(str(case) for case, result in again if not agree(kept[case], result))
+    return Repetition(kind, len(cases), len(drawn), seed, different)

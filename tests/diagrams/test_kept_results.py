@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.kept_results import KeptResultsError, read_results, write_results
+from vtbdrake_diagrams.kept_results import KeptResultsError, read_results, repeat, write_results
+from vtbdrake_diagrams.processes import in_processes
 
 RESULTS = {"times": np.array([1.5, np.nan]), "name": "a", "rows": [{"count": 2}]}
 
@@ -35,7 +36,48 @@ def test_missing_file_names_its_remedy(tmp_path: Path) -> None:
         read_results(tmp_path / "kept.json")
 
 
-@pytest.mark.parametrize("study", ["mount", "scan_frequency"])
+@pytest.mark.parametrize(
+    "study", ["mount", "scan_frequency", "scanned_captures", "lighting", "trajectory", "planned_capture"]
+)
 def test_results_of_the_studies_have_their_digest(study: str) -> None:
     folder = Path(__file__).resolve().parents[2] / "diagrams/satellite/studies"
     assert read_results(folder / f"{study}.json")
+
+
+SQUARES = {number: float(number**2) for number in range(1, 31)}
+
+
+def square(number: int) -> float:
+    return float(number) ** 2
+
+
+def near(before: float, now: float) -> bool:
+    return abs(before - now) < 0.5
+
+
+def test_a_tenth_is_made_again_and_is_the_same() -> None:
+    repetition = repeat("squares", SQUARES, square, near, workers=1)
+    assert (repetition.count, repetition.kept, repetition.same) == (3, 30, True)
+    assert str(repetition) == f"3 of 30 kept squares simulated again (drawn by seed {repetition.seed}): as kept"
+
+
+def test_results_that_come_out_differently_are_named() -> None:
+    wrong = {**SQUARES, 7: 50.0}
+    assert repeat("squares", wrong, square, near, share=1.0, workers=1).different == ("7",)
+    # One wrong result of 30 is among a tenth in one of ten draws.
+    draws = [repeat("squares", wrong, square, near, seed=seed, workers=1) for seed in range(200)]
+    assert 5 < sum(not draw.same for draw in draws) < 40
+    assert "OTHERS than kept: 7" in str(next(draw for draw in draws if not draw.same))
+
+
+def test_seed_draws_the_same_results_again() -> None:
+    wrong = {number: -1.0 for number in SQUARES}
+    first = repeat("squares", wrong, square, near, workers=1)
+    assert repeat("squares", wrong, square, near, seed=first.seed, workers=1) == first
+    others = {repeat("squares", wrong, square, near, workers=1).different for _ in range(5)}
+    assert len(others) > 1
+
+
+@pytest.mark.slow
+def test_processes_give_results_in_the_order_of_the_cases() -> None:
+    assert list(in_processes(abs, [-3, 1, -2], workers=2)) == [(-3, 3), (1, 1), (-2, 2)]

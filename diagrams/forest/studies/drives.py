@@ -19,9 +19,7 @@ The criteria, fixed before any of the forests from `SEED` on was driven:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from typing import Any, Self, TypeVar
 
 import click
@@ -44,6 +42,7 @@ from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 from vtbdrake_diagrams.plain.scenario import PlainScenario
+from vtbdrake_diagrams.processes import in_processes
 
 INDEPENDENT = 100.0
 """Estimates count as independent if they are at least this far apart along the path, in m."""
@@ -571,7 +570,6 @@ def plain(seed: int, *, range_bias: float = 0.0) -> PlainScenario:
 
 
 _Carrier = TypeVar("_Carrier", bound=CarrierScenario)
-_Result = TypeVar("_Result")
 
 
 def _begun(scenario: _Carrier, rng: np.random.Generator) -> _Carrier:
@@ -619,14 +617,6 @@ class Drives:
     def through(self, seeds: Sequence[int], *, workers: int = 2) -> Iterator[dict[str, Track]]:
         """Drive through the forests of some seeds in processes, and yield the tracks by map in the order of seeds."""
         yield from (tracks for _, tracks in in_processes(self, seeds, workers=workers))
-
-
-def in_processes(
-    function: Callable[[int], _Result], seeds: Sequence[int], *, workers: int
-) -> Iterator[tuple[int, _Result]]:
-    """Yield each seed with the function's result for it, in the order of the seeds; it runs in processes."""
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from zip(seeds, pool.map(function, seeds), strict=True)
 
 
 def scores(tracks_of_drives: Sequence[Mapping[str, Track]]) -> dict[str, Score]:

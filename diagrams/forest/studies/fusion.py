@@ -31,9 +31,10 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, in_processes, localize, recorded_drive, rms
+from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive, rms
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import read_results, write_results
+from vtbdrake_diagrams.processes import in_processes
 
 SEED = 710_000
 """The seed of the first forest."""

@@ -49,7 +49,6 @@ from vtbdrake_diagrams.forest.studies.drives import (
     Drive,
     Track,
     forest,
-    in_processes,
     memories,
     nees_bounds,
     recorded_drive,
@@ -59,6 +58,7 @@ from vtbdrake_diagrams.forest.studies.drives import (
 )
 from vtbdrake_diagrams.forest.world.stand import Stand
 from vtbdrake_diagrams.kept_results import read_results, write_results
+from vtbdrake_diagrams.processes import in_processes
 
 SEED = 720_000
 """The seed of the first forest. No constant of the revision may be chosen with forests from this seed on."""

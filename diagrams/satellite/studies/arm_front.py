@@ -8,10 +8,8 @@ testbed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 
 import click
 import numpy as np
@@ -19,7 +17,7 @@ import numpy as np
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.pareto import undominated
-from vtbdrake.rollout.executor import cores
+from vtbdrake_diagrams.processes import in_processes
 from vtbdrake_diagrams.satellite.arm_planning import plan_by_casadi
 from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.studies.trajectory import Course, random_scenarios, simulate
@@ -105,10 +103,9 @@ def front(
         echo: Gets a line for each motion, in their order.
     """
     shares = []
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
-        for k, of_motion in enumerate(pool.map(partial(_shares, tuple(aims)), scenarios), 1):
-            shares.append(of_motion)
-            echo(f"motion {k} of {len(scenarios)}")
+    for _, of_motion in in_processes(partial(_shares, tuple(aims)), scenarios):
+        shares.append(of_motion)
+        echo(f"motion {len(shares)} of {len(scenarios)}")
     return Front(tuple(aims), np.array(shares))
 
 
@@ -125,7 +122,8 @@ def _shares(aims: tuple[Aim, ...], scenario: ArmMotionScenario) -> list[list[flo
 
 def _deviations(course: Course) -> Array:
     """Return the deviation at the end and the largest one in rad, and the integral in rad s."""
-    return np.array([course.end, course.largest, course.integral])
+    outcome = course.outcome
+    return np.array([outcome.end, outcome.largest, outcome.integral])
 
 
 @click.command()

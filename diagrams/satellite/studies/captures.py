@@ -16,14 +16,18 @@ The criteria of success, fixed before any result was seen, are in the file:
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import casadi
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context
 
+from vtbdrake.campaigns.campaign import Campaign, Criterion
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state.systems import pose_from_array, pose_later
+from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
 from vtbdrake_diagrams.satellite.kinematics import gripper
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
@@ -104,6 +108,21 @@ def joint_creep(*rates: float) -> float:
 def turned(base: Array) -> float:
     """Return by which angle the base has turned, in deg."""
     return float(np.degrees(pose_from_array(base).rotation().ToAngleAxis().angle()))
+
+
+def succeeds(testbed: VirtualTestbed, context: Context) -> bool:
+    """Return whether a capture that has ended in this context keeps all limits of ``captures.yaml``."""
+    return all(
+        criterion.passes(float(criterion.function()(*(testbed.read(context, name) for name in criterion.addresses))))
+        for criterion in _criteria()
+    )
+
+
+@lru_cache
+def _criteria() -> tuple[Criterion, ...]:
+    """Return the criteria of success, which are all read at the end."""
+    criteria = Campaign.load(Path(__file__).with_name("captures.yaml")).criteria.values()
+    return tuple(criterion for criterion in criteria if criterion.is_limited)
 
 
 @lru_cache

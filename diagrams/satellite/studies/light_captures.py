@@ -13,7 +13,7 @@ import vtbdrake as vtb
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, SerialExecutor
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.start import Starts
-from vtbdrake_diagrams.kept_results import KeptResultsError, read_results, write_results
+from vtbdrake_diagrams.kept_results import KeptResultsError, Repetition, read_results, repeat, write_results
 from vtbdrake_diagrams.satellite.studies.grips import FAILURE, SAMPLE_PERIOD
 from vtbdrake_diagrams.satellite.studies.light_cases import (
     CANDIDATES,
@@ -165,24 +165,22 @@ class Results:
         write_results(RESULTS, {"candidates": self.candidates, "captures": rows}, command=COMMAND)
 
 
-def compare_again(captures: Mapping[Key, Capture], numbers: Sequence[int]) -> bool:
-    """Simulate some of the captures again, and return whether they come out the same.
+def captures_again(captures: Mapping[Key, Capture]) -> Repetition:
+    """Simulate a tenth of the kept captures again, and return whether they come out the same."""
+    return repeat("captures", captures, simulate_capture, agree)
 
-    The times may differ by a sample, and the errors by a tenth of a millimetre: renderers round differently.
 
-    Args:
-        captures: The kept captures.
-        numbers: Which of them, from 0.
-    """
-    keys = [list(captures)[number] for number in numbers]
-    anew: dict[Key, Capture] = {}
-    executor = KeptCaptures(anew, keep=lambda: None)
-    for values, case in keys:
-        problem = lighting_problem([case])
-        list(executor.run(problem.task, [problem.values(values, condition=0)]))
-    return all(agree(captures[key], anew[key]) for key in keys)
+def simulate_capture(key: Key) -> Capture:
+    """Simulate the capture of a candidate in a case."""
+    values, case = key
+    problem, captures = lighting_problem([case]), dict[Key, Capture]()
+    list(KeptCaptures(captures, keep=lambda: None).run(problem.task, [problem.values(values, condition=0)]))
+    return captures[key]
 
 
 def agree(before: Capture, now: Capture) -> bool:
-    """Return whether two simulations of one capture agree."""
+    """Return whether two simulations of one capture agree.
+
+    The times may differ by a sample, and the errors by a tenth of a millimetre: renderers round differently.
+    """
     return abs(before.time - now.time) <= 1.5 * SAMPLE_PERIOD and abs(before.error - now.error) <= 1e-4

@@ -19,8 +19,8 @@ The answer has four stages, and each capture of all of them is kept:
 
 All of this was fixed before the first capture. ``python -m vtbdrake_diagrams.satellite.studies.lighting --full``
 simulates what is missing in ``lighting.json`` beside this module, and keeps each capture: it may be ended and
-continued. Without ``--full`` the results are read. The row of the answers reads them, and simulates a few captures
-anew.
+continued. Without ``--full`` the results are read. The row of the answers reads them, and simulates a tenth of the
+captures again.
 
 The problem is in ``light_cases.py`` beside this module, the captures that are kept in ``light_captures.py``, the stages
 in ``light_campaign.py``, what they show in ``light_answer.py`` and ``light_plots.py``.
@@ -32,13 +32,12 @@ from collections.abc import Callable
 from typing import Any
 
 import click
-import numpy as np
 
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.satellite.studies.grips import FAILURE
 from vtbdrake_diagrams.satellite.studies.light_answer import CONFIDENCE, LightingAnswer, by_light
 from vtbdrake_diagrams.satellite.studies.light_campaign import Campaign
-from vtbdrake_diagrams.satellite.studies.light_captures import RESULTS, Capture, Key, Results, compare_again
+from vtbdrake_diagrams.satellite.studies.light_captures import RESULTS, Capture, Key, Results, captures_again
 from vtbdrake_diagrams.satellite.studies.light_cases import (
     BY_HAND,
     CANDIDATES,
@@ -52,9 +51,6 @@ from vtbdrake_diagrams.satellite.studies.light_cases import (
     text,
 )
 from vtbdrake_diagrams.satellite.studies.light_plots import plot_answer
-
-RERUN = 3
-"""How many captures the row simulates anew."""
 
 
 def answer_lighting(
@@ -87,15 +83,13 @@ def answer_lighting(
 def lighting(full: bool) -> Answer:
     """Answer O3: which parameters of the robot are best under different lighting?
 
-    The short version reads the kept captures, and simulates `RERUN` of them anew, drawn at random.
+    The short version reads the kept captures. Both simulate a tenth of them again, drawn at random.
     """
     results = Results.read()
     captures, keep = results.captures, results.write if full else None
     answer = answer_lighting(captures, candidates=results.candidates, keep=keep)
-    numbers = sorted(np.random.default_rng().choice(len(captures), RERUN, replace=False).tolist())
-    same = compare_again(captures, numbers)
+    repetition = captures_again(captures)
     today, robust = (answer.of(values, answer.judged) for values in (TODAY, answer.choice))
-    claims = {**answer.claims, f"{RERUN} kept captures simulated anew agree": same}
     paid = "; ".join(
         f"{light} {now - time:.1f} s ({text(values)})" for light, (values, time, now) in answer.best_alone.items()
     )
@@ -112,12 +106,12 @@ def lighting(full: bool) -> Answer:
         baseline=f"today's constants: {sum(not c.failed for c in today)} of {len(today)} grips, the choice "
         f"{sum(not c.failed for c in robust)}",
         refused=sum(capture.failed for capture in robust),
-        holds=all(claims.values()),
+        holds=all(answer.claims.values()) and repetition.same,
         note=f"Interval: of {CONFIDENCE:.0%}, of the seconds won in the mean, a failure costs {FAILURE:g} s. "
         f"Today: {by_light(answer, TODAY, answer.judged)}. Choice: {by_light(answer, answer.choice, answer.judged)}. "
         f"What the choice pays against the best for each light alone: {paid}. {_sensitive(answer)} "
-        + "; ".join(f"{claim}: {'yes' if true else 'NO'}" for claim, true in claims.items())
-        + ".",
+        + "; ".join(f"{claim}: {'yes' if true else 'NO'}" for claim, true in answer.claims.items())
+        + f". {repetition}.",
     )
 
 

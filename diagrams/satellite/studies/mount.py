@@ -20,13 +20,14 @@ judged, too. At last the placements judged guide captures themselves, without wh
 
 ``python -m vtbdrake_diagrams.satellite.studies.mount --full`` does what is missing in ``mount.json`` beside this
 module, keeps it step by step and draws the answer; without ``--full`` the results are read. The row of the answers
-reads them, and judges a few captures anew.
+reads them, and judges a tenth of the captures again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake.visualization.study_plots import BEST
 from vtbdrake_diagrams.answers import Answer
-from vtbdrake_diagrams.kept_results import read_results, write_results
+from vtbdrake_diagrams.kept_results import Repetition, read_results, repeat, write_results
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.perception import target_board
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
@@ -86,8 +87,6 @@ GUIDED_HORIZON = 36.0
 """How long a capture that the camera guides may take, in s."""
 GUIDED_RATE = 2.5
 """The images per second of a camera that guides, in Hz: less than usual, because images are what a capture costs."""
-RERUN = 2
-"""How many captures the row judges anew."""
 RESULTS = Path(__file__).with_suffix(".json")
 """The results that ``--full`` keeps."""
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --full"
@@ -610,20 +609,22 @@ def answer_mount(
     return answer
 
 
-def compare_again(answer: MountAnswer, numbers: Sequence[int]) -> float:
-    """Judge the placements on some of the captures again, and return the largest difference of a mean count.
+def captures_again(answer: MountAnswer) -> Repetition:
+    """Judge the placements on a tenth of the captures again, and return whether the mean counts are the same."""
+    looks = [(placement.pose, placement.judged) for placement in answer.judged if placement.judged is not None]
+    kept = {number: np.array([look.means[number] for _, look in looks]) for number in range(len(JUDGED_ON))}
+    return repeat("captures", kept, partial(mean_counts, tuple(pose for pose, _ in looks)), agree)
 
-    Args:
-        answer: The kept answer.
-        numbers: Numbers of captures of `JUDGED_ON`.
-    """
-    onlooker = Onlooker([JUDGED_ON[number] for number in numbers])
-    differences = [
-        np.abs(onlooker.look(p.pose).means - p.judged.means[list(numbers)]).max()
-        for p in answer.judged
-        if p.judged is not None
-    ]
-    return float(np.max(differences))
+
+def mean_counts(poses: Sequence[Array], number: int) -> Array:
+    """Return the mean count of markers from each of some poses in a capture, given by its number in `JUDGED_ON`."""
+    onlooker = Onlooker([JUDGED_ON[number]])
+    return np.array([onlooker.look(pose).mean for pose in poses])
+
+
+def agree(before: Array, now: Array) -> bool:
+    """Return whether mean counts differ by less than means anything."""
+    return bool(np.abs(before - now).max() < TELLING)
 
 
 # -- pictures and words
@@ -685,16 +686,13 @@ def _draw_slice(axes: Axes, answer: MountAnswer, key: str, title: str) -> None:
 def mount(full: bool) -> Answer:
     """Answer O1: where should the docking camera sit?
 
-    The short version reads the kept results, and judges the placements anew on `RERUN` captures drawn at random.
+    The short version reads the kept results. Both judge the placements again on a tenth of the captures, drawn at
+    random.
     """
     result = answer_mount() if full else MountAnswer.of(read_results(RESULTS))
-    numbers = sorted(np.random.default_rng().choice(len(JUDGED_ON), RERUN, replace=False).tolist())
-    difference = 0.0 if full else compare_again(result, numbers)
+    repetition = captures_again(result)
     lower, mean, upper = result.gain()
     looks = "; ".join(_words(placement) for placement in result.judged)
-    again = (
-        "" if full else f"Captures {numbers} judged again: means differ by {difference:.2g} at most (kept results). "
-    )
     return Answer(
         id="O1",
         question="Where should the docking camera sit to see the most markers during the capture?",
@@ -705,8 +703,8 @@ def mount(full: bool) -> Answer:
         cases=f"{len(FOUND_ON)} captures, one at each of {len(TUMBLES)} tumble rates",
         held_out=f"{len(JUDGED_ON)} others at the same rates",
         baseline=f"{result.well_aimed.name}, {result.well_aimed.rule}: the best by hand",
-        holds=result.holds and difference < TELLING,
-        note=f"{again}Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing.",
+        holds=result.holds and repetition.same,
+        note=f"Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing. {repetition}.",
     )
 
 

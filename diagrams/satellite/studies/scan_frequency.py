@@ -4,15 +4,15 @@ The servicer rests, the target comes closer and tumbles, and the DPS follows it 
 suffices if nine of ten approaches, from random starts, keep the error within the tolerance: the 90 % quantile of the
 largest error, with its interval of confidence. With few scans the target moves on between them, and with many a scan
 has few points: so the answer is a window, with two ends, for each tumble rate, and with scans as they come or
-de-skewed. At last some frequencies guide captures.
+de-skewed. Whether the window is the same within captures is asked by ``scanned_captures.py`` beside this module.
 
 Everything that decides the answer was fixed before it was seen; the reasons are beside the numbers. Only the quantile
 and the window came later: before, the answer rested on one or two approaches, and was the least frequency.
 
 ``python -m vtbdrake_diagrams.satellite.studies.scan_frequency --full`` simulates what is missing in
 ``scan_frequency.json`` beside this module, in blocks of approaches, the undecided frequencies first, and keeps each
-block: it may be ended and continued. Without ``--full`` the results are read. The row of the answers reads them, and
-simulates some of the approaches anew.
+block: it may be ended and continued. Without ``--full`` the results are read. The row of the answers is in
+``scan_answer.py``: it reads them, and simulates a tenth of the approaches again.
 """
 
 from __future__ import annotations
@@ -44,16 +44,13 @@ from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.visualization.plots import Picture, finish
-from vtbdrake_diagrams.answers import Answer
-from vtbdrake_diagrams.kept_results import read_results, write_results
+from vtbdrake_diagrams.kept_results import Repetition, read_results, repeat, write_results
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.dps import PERIOD
 from vtbdrake_diagrams.satellite.estimation import BaseEstimator
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_scan_part
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target, plant_config
-from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
-from vtbdrake_diagrams.satellite.start import Release, Start, random_start
-from vtbdrake_diagrams.satellite.studies.grips import FAILURE, guided_grips
+from vtbdrake_diagrams.satellite.start import Release, Start
 
 APPROACH = 16.0
 """How long the approach takes, in s."""
@@ -81,14 +78,6 @@ STARTS = tuple(range(30))
 end."""
 BLOCK = 6
 """How many approaches are simulated before the next decision what is missing most."""
-RERUN = 4
-"""How many approaches the row simulates anew."""
-CAPTURE_FREQUENCIES = (1.0, 4.0, 16.0)
-"""The frequencies of the scanner that guides captures, in Hz."""
-CAPTURE_SEEDS = (100, 101, 102)
-"""The starts of these captures."""
-CAPTURE_HORIZON = 36.0
-"""How long such a capture may take, in s."""
 RESULTS = Path(__file__).with_suffix(".json")
 """The results that ``--full`` keeps."""
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.scan_frequency --full"
@@ -272,11 +261,12 @@ class Window:
             return "none of the grid"
         ends = f"not at {least:g} Hz" if least else "no lower end shown"
         ends += f" and {most:g} Hz" if most < inf else ", no upper end shown"
-        surely = "none surely" if np.isnan(sure_too) else f"surely {_range(sure, sure_too)}"
-        return f"{_range(first, last)} ({surely}; {ends})"
+        surely = "none surely" if np.isnan(sure_too) else f"surely {range_text(sure, sure_too)}"
+        return f"{range_text(first, last)} ({surely}; {ends})"
 
 
-def _range(first: float, last: float) -> str:
+def range_text(first: float, last: float) -> str:
+    """Return a range of frequencies in Hz as text."""
     return f"{first:g} Hz" if first == last else f"{first:g} to {last:g} Hz"
 
 
@@ -310,32 +300,15 @@ Key = tuple[str, float, float]  # kind of scans, tumble rate in deg/s, frequency
 
 
 @dataclass(frozen=True)
-class GuidedCaptures:
-    """The captures that a scanner with some frequency has guided.
-
-    Attributes:
-        frequency: In Hz.
-        times: When the fingers held the bar, in s, `FAILURE` if they never did.
-        errors: How far the bar was from where the DPS believed it then, in m; NaN without success.
-    """
-
-    frequency: float
-    times: Array
-    errors: Array
-
-
-@dataclass(frozen=True)
 class FrequencyAnswer:
     """The errors at the bar in approaches, over kinds of scans, tumble rates and frequencies.
 
     Attributes:
         errors: The largest error over time of each approach from the first of `STARTS` on, in m, infinite if the
             approach failed.
-        captures: The captures that some frequencies have guided, with de-skewed scans.
     """
 
     errors: dict[Key, list[float]]
-    captures: tuple[GuidedCaptures, ...] = ()
 
     def frequencies(self, kind: str, tumble: float) -> list[float]:
         """Return the frequencies that were tried, in Hz, increasing."""
@@ -415,11 +388,7 @@ def read_answer(path: Path = RESULTS) -> FrequencyAnswer:
         (row["scans"], row["tumble_deg"], row["frequency"]): [inf if e is None else e for e in row["errors"]]
         for row in results["approaches"]
     }
-    captures = [
-        GuidedCaptures(row["frequency"], *(np.array(row[k], dtype=float) for k in ("times", "errors")))
-        for row in results["captures"]
-    ]
-    return FrequencyAnswer(errors, tuple(captures))
+    return FrequencyAnswer(errors)
 
 
 def keep(answer: FrequencyAnswer, path: Path = RESULTS) -> None:
@@ -428,7 +397,7 @@ def keep(answer: FrequencyAnswer, path: Path = RESULTS) -> None:
         {"scans": kind, "tumble_deg": tumble, "frequency": frequency, "errors": errors}
         for (kind, tumble, frequency), errors in sorted(answer.errors.items())
     ]
-    write_results(path, {"approaches": approaches, "captures": answer.captures}, command=COMMAND)
+    write_results(path, {"approaches": approaches}, command=COMMAND)
 
 
 def next_block(errors: Mapping[Key, Sequence[float]]) -> tuple[Key, tuple[int, ...]] | None:
@@ -462,20 +431,6 @@ def approach_errors(key: Key, starts: Sequence[int], executor: str | Executor = 
     return [inf if rollout.failed else rollout.value for rollout in sweep.rollouts]
 
 
-def guide(frequency: float, seeds: Sequence[int] = CAPTURE_SEEDS) -> GuidedCaptures:
-    """Simulate captures that the scanner guides alone, with de-skewed scans and wheels.
-
-    Args:
-        frequency: The scan frequency, in Hz.
-        seeds: The starts.
-    """
-    scanner = replace(SCANNER, frequency=frequency)
-    scenario = SatelliteScenario(perception="scanner", wheels=True, tumble_deg=TUMBLES[0], scanner=scanner)
-    tumble = radians(scenario.tumble_deg)
-    starts = [random_start(seed, tumble=tumble, distance=scenario.distance).values() for seed in seeds]
-    return GuidedCaptures(frequency, *guided_grips(scenario, starts, horizon=CAPTURE_HORIZON))
-
-
 def continue_campaign(
     answer: FrequencyAnswer, *, blocks: int | None = None, executor: str | Executor = "serial", path: Path = RESULTS
 ) -> FrequencyAnswer:
@@ -497,29 +452,40 @@ def continue_campaign(
     return answer
 
 
-def guided_captures() -> tuple[GuidedCaptures, ...]:
-    """Simulate the captures that the scanner guides, at all `CAPTURE_FREQUENCIES`."""
-    return tuple(guide(frequency) for frequency in CAPTURE_FREQUENCIES)
+def approaches_again(answer: FrequencyAnswer) -> Repetition:
+    """Simulate a tenth of the kept approaches again, and return whether they come out the same."""
+    kept = {
+        Approach(*key, start): error
+        for key, errors in sorted(answer.errors.items())
+        for start, error in zip(STARTS, errors, strict=False)
+    }
+    return repeat("approaches", kept, approach_error, agree)
 
 
-def compare_again(answer: FrequencyAnswer, count: int = RERUN) -> list[tuple[Key, int, float, float]]:
-    """Simulate some approaches, drawn at random, anew.
+@dataclass(frozen=True)
+class Approach:
+    """An approach of the campaign.
 
-    Args:
-        answer: The kept results.
-        count: How many.
-
-    Returns:
-        What was simulated, its start, the kept error and the error now, in m.
+    Attributes:
+        scans: `RAW` or `DESKEWED`.
+        tumble_deg: The tumble rate, in deg/s.
+        frequency: The scan frequency, in Hz.
+        start: Its start, of `STARTS`.
     """
-    random = np.random.default_rng()
-    keys = sorted(answer.errors)
-    draws = []
-    for number in random.choice(len(keys), count, replace=False).tolist():
-        start = int(random.integers(len(answer.errors[keys[number]])))
-        (error,) = approach_errors(keys[number], [STARTS[start]])
-        draws.append((keys[number], STARTS[start], answer.errors[keys[number]][start], error))
-    return draws
+
+    scans: str
+    tumble_deg: float
+    frequency: float
+    start: int
+
+    def __str__(self) -> str:
+        return f"{self.scans}, {self.tumble_deg:g} deg/s, {self.frequency:g} Hz, start {self.start}"
+
+
+def approach_error(approach: Approach) -> float:
+    """Simulate an approach, and return its largest error over time, in m; infinite if it failed."""
+    (error,) = approach_errors((approach.scans, approach.tumble_deg, approach.frequency), [approach.start])
+    return error
 
 
 def agree(before: float, now: float) -> bool:
@@ -572,74 +538,14 @@ def plot_answer(answer: FrequencyAnswer) -> Figure:
     return figure
 
 
-def frequency(full: bool) -> Answer:
-    """Answer O2: what scan frequency must the laser scanner have?
-
-    The long version simulates first what is missing in the kept results.
-    """
-    result = read_answer()
-    if full:
-        result = continue_campaign(replace(result, captures=result.captures or guided_captures()))
-    draws = [] if full else compare_again(result)
-    same = all(agree(before, now) for _, _, before, now in draws)
-    shared = result.everywhere
-    windows = "; ".join(
-        f"{kind}, {tumble:g} deg/s: {result.window(kind, tumble)}"
-        for kind in (DESKEWED, RAW)
-        for tumble in result.tumbles
-    )
-    claims = {
-        "the median raw error is once to twice v / (2 f)": result.follows,
-        "de-skewed, a lower frequency suffices": result.helps,
-        f"{len(draws)} approaches simulated anew agree": same,
-    }
-    no_window = [tumble for tumble in result.tumbles if isnan(result.window(DESKEWED, tumble).lower[1])]
-    return Answer(
-        id="O2",
-        question="What scan frequency must the laser scanner have to measure the moving target accurately?",
-        answer=f"de-skewed, {_range(shared.lower[1], shared.upper[1])} at all tumble rates",
-        unit="",
-        interval=(shared.lower[0], shared.upper[2]),
-        paper="none given",
-        cases=f"at least {result.fewest} approaches with each of {len(result.errors)} kinds of scans, tumble rates and "
-        "frequencies",
-        held_out="",
-        baseline=f"the same scans, raw: {_shared_raw(result)}",
-        refused=len(no_window),
-        holds=result.holds and same,
-        note=f"Frequencies for which the error at the bar is below {1e3 * TOLERANCE:.1f} mm in {QUANTILE:.0%} of the "
-        f"approaches, with confidence {CONFIDENCE:.0%}; the interval's ends surely do not suffice. {windows}. "
-        f"{_not_shown(result)}{_capture_words(result)}"
-        + "; ".join(f"{claim}: {'yes' if true else 'NO'}" for claim, true in claims.items())
-        + ".",
-    )
-
-
-def _shared_raw(answer: FrequencyAnswer) -> str:
-    """Return in words which frequencies suffice at all tumble rates with raw scans."""
-    windows = [answer.window(RAW, tumble) for tumble in answer.tumbles]
-    first, last = (np.array([getattr(w, end)[1] for w in windows]) for end in ("lower", "upper"))
-    suffices = first.max() <= last.min()  # False if an end is NaN.
-    return _range(float(first.max()), float(last.min())) if suffices else "no frequency suffices"
-
-
-def _not_shown(answer: FrequencyAnswer) -> str:
-    """Return in words which frequencies are not decided, or an empty text."""
+def not_decided(answer: FrequencyAnswer) -> str:
+    """Return in words which frequencies the approaches do not decide, or an empty text."""
     undecided = [
         f"{kind} {tumble:g} deg/s {frequency:g} Hz ({len(errors)} approaches)"
         for (kind, tumble, frequency), errors in sorted(answer.errors.items())
         if (bounds := quantile_bounds(errors))[0] < TOLERANCE < bounds[2]
     ]
     return f"Not decided: {', '.join(undecided)}. " if undecided else ""
-
-
-def _capture_words(answer: FrequencyAnswer) -> str:
-    rows = [
-        f"{c.frequency:g} Hz {int((c.times < FAILURE).sum())} of {len(c.times)}"
-        + (f", {1e3 * np.nanmax(c.errors):.1f} mm off at most" if (c.times < FAILURE).any() else "")
-        for c in answer.captures
-    ]
-    return f"Captures guided by the scanner alone at {TUMBLES[0]:g} deg/s: {'; '.join(rows)}. " if rows else ""
 
 
 @click.command()
@@ -652,9 +558,6 @@ def main(full: bool, blocks: int | None, figure: str) -> None:
     if full:
         with ProcessExecutor(2) as executor:
             result = continue_campaign(result, blocks=blocks, executor=executor)
-        if not result.captures:
-            result = replace(result, captures=guided_captures())
-            keep(result)
     click.echo(f"{QUANTILE:.0%} quantile of the error at the bar [mm], [lower, upper bound], approaches")
     for kind in (RAW, DESKEWED):
         for tumble in result.tumbles:
@@ -664,7 +567,7 @@ def main(full: bool, blocks: int | None, figure: str) -> None:
                 numbers = f"{1e3 * quantile:6.1f} [{1e3 * lower:.1f}, {1e3 * upper:.1f}] {count}"
                 click.echo(f"{kind:>10} {tumble:4g} deg/s {f:5g} Hz {numbers}")
             click.echo(f"{kind:>10} {tumble:4g} deg/s: {result.window(kind, tumble)}")
-    click.echo(f"{_not_shown(result)}{_capture_words(result)}")
+    click.echo(not_decided(result))
     click.echo(f"follows: {result.follows}; helps: {result.helps}; holds: {result.holds}")
     plot_answer(result).savefig(figure, dpi=110)
 

@@ -2,18 +2,19 @@
 
 ``python -m vtbdrake_diagrams.satellite.studies.trajectory [FILE]`` moves the arm from its stowed pose to the pose of a
 capture, on the straight path and on the plan that the DPS decides on board, and plots the deviation of the base. With
-``--pairs N`` it asks for N random pairs of start and goal instead, and prints the factors.
+``--pairs N`` it prints what becomes of N random pairs of start and goal instead: those that are missing in
+``trajectory.json`` beside this module are planned and simulated first, and each is kept there. The row of the answers
+reads them, and makes a tenth of them again.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from multiprocessing import get_context
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -21,9 +22,10 @@ import numpy as np
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.compiled_plant import rotation_angle
 from vtbdrake.optimization import Problem
-from vtbdrake.rollout.executor import cores
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.kept_results import read_results, repeat, write_results
+from vtbdrake_diagrams.processes import in_processes
 from vtbdrake_diagrams.satellite.arm_move import REACHING
 from vtbdrake_diagrams.satellite.arm_planning import plan_calmly
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Servicer
@@ -38,11 +40,15 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import (
     free_knots,
     limits,
 )
-from vtbdrake_diagrams.satellite.studies.planned_capture import PlannedCaptures, kept_captures, median
+from vtbdrake_diagrams.satellite.studies.planned_capture import PlannedCaptures, captures_again, kept_captures, median
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+RESULTS = Path(__file__).with_suffix(".json")
+"""The pairs that are kept."""
+COMMAND = "python -m vtbdrake_diagrams.satellite.studies.trajectory --pairs 100"
+"""The command that makes them."""
 
 # Largest distance of a start from the stowed pose, in rad.
 _START_SPREAD = 0.2
@@ -50,12 +56,12 @@ _START_SPREAD = 0.2
 _GOAL_SPREAD = 0.6
 # The factor that answers the question, fixed before the pairs were drawn.
 _FACTOR = 10.0
-# Number of pairs in the short version.
-_PAIRS = 100
-# Number of pairs in the long version.
+# Number of pairs of the long version.
 _PAIRS_FULL = 400
 # Seed by which they are drawn.
 _SEED = 2027
+# When their motions begin, in s.
+_THINKING_TIME = 0.5
 # Starts of the solver for a pair.
 _STARTS = 2
 # What the servos add to the rates of the plan, and to its largest deviation; shares.
@@ -64,6 +70,34 @@ _OVERSHOOT = 0.05
 _MISS = 1e-3
 # What the servos, which lag behind the plan, have to leave of its clearance, in m.
 _LEFT = 0.01
+# By how much two simulations of one plan may differ: a share, and an angle in rad.
+_SAME_SHARE = 0.05
+_SAME_ANGLE = 2e-4
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The numbers by which a motion of the arm in the full testbed is judged.
+
+    Attributes:
+        end: q, the deviation of the base's attitude at the end, in rad.
+        largest: The largest deviation, in rad.
+        integral: The integral of the deviation over time, in rad s.
+        rate: The largest rate of a joint, as a share of its limit.
+        torque: The largest torque of a drive, as a share of its limit.
+        miss: The distance of the joints from the goal at the end, in rad.
+        clearance: The least distance of the arm from base, panels and itself in m, by Drake.
+        nearest: Between what this distance is.
+    """
+
+    end: float
+    largest: float
+    integral: float
+    rate: float
+    torque: float
+    miss: float
+    clearance: float
+    nearest: str
 
 
 @dataclass(frozen=True)
@@ -86,30 +120,20 @@ class Course:
     positions: Array
     goal: Array
 
-    @property
-    def end(self) -> float:
-        """Return q, the deviation at the end, in rad."""
-        return float(self.deviations[-1])
-
-    @property
-    def largest(self) -> float:
-        """Return the largest deviation, in rad."""
-        return float(self.deviations.max())
-
-    @property
-    def integral(self) -> float:
-        """Return the integral of the deviation over time, in rad s."""
-        return float(np.trapezoid(self.deviations, self.times))
-
-    @property
-    def miss(self) -> float:
-        """Return the distance of the joints from the goal at the end, in rad."""
-        return float(np.max(np.abs(self.positions[-1] - self.goal)))
-
     @cached_property
-    def nearest(self) -> tuple[float, str]:
-        """Return the least distance of the arm from base, panels and itself in m, by Drake, and what it was between."""
-        return min(map(_drake_clearance().nearest, self.positions))
+    def outcome(self) -> Outcome:
+        """Return the numbers by which the motion is judged."""
+        clearance, nearest = min(map(_drake_clearance().nearest, self.positions))
+        return Outcome(
+            end=float(self.deviations[-1]),
+            largest=float(self.deviations.max()),
+            integral=float(np.trapezoid(self.deviations, self.times)),
+            rate=float(self.rates.max()),
+            torque=float(self.torques.max()),
+            miss=float(np.max(np.abs(self.positions[-1] - self.goal))),
+            clearance=clearance,
+            nearest=nearest,
+        )
 
 
 def simulate(scenario: ArmMotionScenario, knots: Array | None = None) -> Course:
@@ -192,7 +216,7 @@ def _motions(draw: Callable[[], tuple[Array, Array]]) -> Iterator[ArmMotionScena
     """Yield the motions between drawn poses that are possible."""
     while True:
         start, goal = draw()
-        scenario = ArmMotionScenario(start=start.tolist(), goal=goal.tolist(), thinking_time=0.5)
+        scenario = ArmMotionScenario(start=start.tolist(), goal=goal.tolist(), thinking_time=_THINKING_TIME)
         try:
             scenario.validate()
         except ScenarioError:
@@ -207,15 +231,20 @@ class Comparison:
     """The straight path of a motion beside the best plan, both in the full testbed.
 
     Attributes:
-        straight: The motion on the straight path.
-        best: That on the best plan.
+        straight: The outcome on the straight path.
+        best: The outcome on the best plan.
         touched: The limits that the plan uses up, by the momentum model, see `Move.touched`; not of a decision on
             board.
     """
 
-    straight: Course
-    best: Course
+    straight: Outcome
+    best: Outcome
     touched: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(stored: Mapping[str, Any]) -> Comparison:
+        """Return what was kept."""
+        return Comparison(Outcome(**stored["straight"]), Outcome(**stored["best"]), tuple(stored["touched"]))
 
     @property
     def factor(self) -> float:
@@ -228,16 +257,16 @@ class Comparison:
 
         The clearance is judged by Drake's distances.
         """
-        rates, torques = self.best.rates.max(), self.best.torques.max()
-        arrives, clear = self.best.miss < _MISS, self.best.nearest[0] >= _LEFT
-        return bool(max(rates, torques) <= 1.0 + _OVERSHOOT) and arrives and clear and self.turns_within
+        best = self.best
+        arrives, clear = best.miss < _MISS, best.clearance >= _LEFT
+        return max(best.rate, best.torque) <= 1.0 + _OVERSHOOT and arrives and clear and self.turns_within
 
     def __str__(self) -> str:
         straight, best = self.straight, self.best
-        limits, (distance, pair) = "within" if self.within_limits else "EXCEEDS", best.nearest
+        limits = "within" if self.within_limits else "EXCEEDS"
         return (
             f"{np.degrees(straight.end):6.2f} deg -> {np.degrees(best.end):6.3f} deg, factor {self.factor:7.1f}; "
-            f"clearance {1e3 * distance:5.1f} mm ({pair}); {limits} the limits, uses up "
+            f"clearance {1e3 * best.clearance:5.1f} mm ({best.nearest}); {limits} the limits, uses up "
             f"{', '.join(self.touched) or 'none'}"
         )
 
@@ -246,14 +275,53 @@ class Comparison:
         """Return whether the deviation on the way is at most the straight path's."""
         return self.best.largest <= (1.0 + _OVERSHOOT) * self.straight.largest
 
+    def agrees(self, other: Comparison) -> bool:
+        """Return whether another comparison of the same motion is the same, but for rounding on another processor."""
+        pairs = [
+            (getattr(mine, name), getattr(its, name))
+            for mine, its in ((self.straight, other.straight), (self.best, other.best))
+            for name in ("end", "largest")
+        ]
+        same = all(abs(a - b) <= max(_SAME_SHARE * a, _SAME_ANGLE) for a, b in pairs)
+        return same and self.within_limits == other.within_limits
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A random pair of start and goal.
+
+    Attributes:
+        number: Its place in `random_scenarios`; the even ones reach forward from near the stowed pose.
+        start: Positions of the joints at the start in rad, (7,).
+        goal: Their positions at the end in rad, (7,).
+    """
+
+    number: int
+    start: tuple[float, ...]
+    goal: tuple[float, ...]
+
+    def __str__(self) -> str:
+        return f"pair {self.number}"
+
 
 def compare(scenario: ArmMotionScenario) -> Comparison:
     """Return the straight path beside the best plan by the momentum model, or that decided on board."""
-    straight = simulate(replace(scenario, onboard=False))
+    straight = simulate(replace(scenario, onboard=False)).outcome
     if scenario.onboard:
-        return Comparison(straight, simulate(scenario))
+        return Comparison(straight, simulate(scenario).outcome)
     plan = plan_calmly(scenario.move(), attempts=_STARTS)
-    return Comparison(straight, simulate(scenario, plan.knots), tuple(plan.move.touched(plan.knots)))
+    return Comparison(straight, simulate(scenario, plan.knots).outcome, tuple(plan.move.touched(plan.knots)))
+
+
+def compare_pair(pair: Pair) -> Comparison:
+    """Return the comparison of a random pair."""
+    return compare(ArmMotionScenario(start=list(pair.start), goal=list(pair.goal), thinking_time=_THINKING_TIME))
+
+
+def random_pairs(count: int) -> list[Pair]:
+    """Return the first random pairs of the application."""
+    scenarios = random_scenarios(count, seed=_SEED)
+    return [Pair(number, tuple(each.start), tuple(each.goal)) for number, each in enumerate(scenarios)]
 
 
 @dataclass(frozen=True)
@@ -317,7 +385,8 @@ class Survey:
         return self.interval[0] >= _FACTOR and not self.outside
 
     def __str__(self) -> str:
-        distance, pair = min(comparison.best.nearest for comparison in self.comparisons)
+        least_clear = min((comparison.best for comparison in self.comparisons), key=lambda best: best.clearance)
+        distance, pair = 1e3 * least_clear.clearance, least_clear.nearest
         ends = np.degrees([(comparison.straight.end, comparison.best.end) for comparison in self.comparisons])
         n, (lower, upper) = len(self.factors), self.interval
         least, most = (100.0 * share for share in self.share)
@@ -329,7 +398,7 @@ class Survey:
             f"{upper:.0f}); {self.successes} reach {_FACTOR:g} (90 %: {least:.0f} to {most:.0f} %). In the end the "
             f"base is off by {best:.3f} deg (median; at most {worst:.3f} in 90 %), on the straight path by "
             f"{straight:.2f}. {self._disturbed()}. Plans that exceed a limit: {len(self.outside)}; least clearance by "
-            f"Drake {1e3 * distance:.1f} mm, of {pair}. Limits that the plans below {_FACTOR:g} use up: {limits}."
+            f"Drake {distance:.1f} mm, of {pair}. Limits that the plans below {_FACTOR:g} use up: {limits}."
         )
 
     def _disturbed(self) -> str:
@@ -350,6 +419,13 @@ class TrajectoryAnswer:
     reaching: Survey
     anywhere: Survey
     onboard: Comparison
+
+    @staticmethod
+    def of(comparisons: Mapping[Pair, Comparison], onboard: Comparison) -> TrajectoryAnswer:
+        """Return the answer from the comparisons of random pairs, and of the motion that is decided on board."""
+        kinds = ([each for pair, each in comparisons.items() if pair.number % 2 == kind] for kind in (0, 1))
+        reaching, anywhere = (Survey(tuple(kind)) for kind in kinds)
+        return TrajectoryAnswer(reaching, anywhere, onboard)
 
     @property
     def holds(self) -> bool:
@@ -376,32 +452,48 @@ def verdicts(reaching: Survey, anywhere: Survey) -> str:
     )
 
 
-def survey(scenarios: Sequence[ArmMotionScenario], *, echo: Callable[[str], None] = lambda line: None) -> Survey:
-    """Return what the best plans by the momentum model make of some motions, in the full testbed.
+def kept_comparisons() -> dict[Pair, Comparison]:
+    """Return the comparisons that are kept, by pair."""
+    rows = read_results(RESULTS)["pairs"] if RESULTS.exists() else []
+    return {Pair(row["number"], tuple(row["start"]), tuple(row["goal"])): Comparison.of(row) for row in rows}
 
-    The motions are planned and simulated in processes, one per core.
+
+def keep_comparisons(comparisons: Mapping[Pair, Comparison]) -> None:
+    """Keep the comparisons of some pairs."""
+    rows = [{**vars(pair), **vars(comparisons[pair])} for pair in sorted(comparisons, key=lambda pair: pair.number)]
+    write_results(RESULTS, {"pairs": rows}, command=COMMAND)
+
+
+def survey(count: int, *, echo: Callable[[str], Any] = lambda line: None, workers: int | None = None) -> Survey:
+    """Return what the best plans by the momentum model make of the first random pairs, in the full testbed.
+
+    Those that are not kept are planned and simulated in processes, and each is kept.
 
     Args:
-        scenarios: The motions.
-        echo: Gets a line for each motion, in their order.
+        count: The number of pairs.
+        echo: Gets a line for each new pair, in their order.
+        workers: The number of processes; by default one per core.
     """
-    comparisons = []
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
-        for comparison in pool.map(compare, scenarios):
-            comparisons.append(comparison)
-            echo(str(comparison))
-    return Survey(tuple(comparisons))
+    pairs, kept = random_pairs(count), kept_comparisons()
+    missing = [pair for pair in pairs if pair not in kept]
+    for pair, comparison in in_processes(compare_pair, missing, workers=workers):
+        kept[pair] = comparison
+        keep_comparisons(kept)
+        echo(f"{pair}: {comparison}")
+    return Survey(tuple(kept[pair] for pair in pairs))
 
 
 def answer(full: bool) -> Answer:
     """Answer R2: which trajectory of the arm disturbs the base least?
 
-    What the plans are worth in captures is read from the kept ones.
+    The random pairs, and the captures that show what the plans are worth there, are read from files; a tenth of each is
+    made again. The long version plans and simulates more pairs first, and keeps them.
     """
-    comparisons = survey(random_scenarios(_PAIRS_FULL if full else _PAIRS, seed=_SEED)).comparisons
-    result = TrajectoryAnswer(
-        Survey(comparisons[0::2]), Survey(comparisons[1::2]), compare(ArmMotionScenario(onboard=True))
-    )
+    if full:
+        survey(_PAIRS_FULL)
+    kept = kept_comparisons()
+    repetitions = repeat("pairs", kept, compare_pair, Comparison.agrees), captures_again()
+    result = TrajectoryAnswer.of(kept, compare(ArmMotionScenario(onboard=True)))
     onboard, anywhere = result.onboard, result.anywhere
     turned = np.degrees([onboard.straight.end, onboard.best.end])
     lower, upper = anywhere.interval
@@ -416,14 +508,14 @@ def answer(full: bool) -> Answer:
         interval=result.reaching.interval,
         paper="none given",
         cases="the momentum model, for each motion anew",
-        held_out=f"the full testbed, {len(comparisons)} random motions and the one that the DPS decides on board",
+        held_out=f"the full testbed, {len(kept)} random motions and the one that the DPS decides on board",
         baseline="the straight path in joint space",
-        holds=result.holds,
+        holds=result.holds and all(repetition.same for repetition in repetitions),
         note=(
             f"In the full testbed: the DPS's decision on board turns the base by {turned[1]:.3f} deg instead of "
             f"{turned[0]:.2f} in the end, by {np.degrees(onboard.best.largest):.2f} instead of "
             f"{np.degrees(onboard.straight.largest):.2f} at most. {verdicts(result.reaching, anywhere)} "
-            f"{PlannedCaptures(kept_captures()).sentence}."
+            f"{PlannedCaptures(kept_captures()).sentence}. {'. '.join(map(str, repetitions))}."
         ),
     )
 
@@ -439,7 +531,7 @@ def plot(courses: dict[str, Course]) -> Figure:
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     axes = figure.add_subplot()
     for name, course in courses.items():
-        label = f"{name}: {np.degrees(course.end):.2f} deg in the end"
+        label = f"{name}: {np.degrees(course.outcome.end):.2f} deg in the end"
         axes.plot(course.times, np.degrees(course.deviations), label=label)
     axes.set(xlabel="time (s)", ylabel="rotation of the base (deg)")
     axes.legend()
@@ -449,18 +541,22 @@ def plot(courses: dict[str, Course]) -> Figure:
 
 @click.command()
 @click.argument("figure", default="arm_trajectory.png")
-@click.option("--pairs", type=click.IntRange(min=10), help="Ask for N random motions instead, and print them.")
-@click.option("--seed", default=_SEED, show_default=True, help="Seed of the random motions.")
-def main(figure: str, pairs: int | None, seed: int) -> None:
+@click.option("--pairs", type=click.IntRange(min=10), help="Print what becomes of N random motions instead.")
+@click.option("--workers", type=click.IntRange(min=1), help="Number of processes; by default one per core.")
+def main(figure: str, pairs: int | None, workers: int | None) -> None:
     """Simulate the straight path and the decision on board, and write the plot FIGURE."""
     if pairs:
-        everything = survey(random_scenarios(pairs, seed=seed), echo=click.echo)
+        everything = survey(pairs, echo=lambda line: click.echo(line, err=True), workers=workers)
         click.echo(str(everything))
         click.echo(verdicts(Survey(everything.comparisons[0::2]), Survey(everything.comparisons[1::2])))
         return
-    comparison = compare(ArmMotionScenario(onboard=True))
-    plot({"straight path": comparison.straight, "decided on board": comparison.best}).savefig(figure, dpi=120)
+    scenario = ArmMotionScenario(onboard=True)
+    courses = {"straight path": simulate(replace(scenario, onboard=False)), "decided on board": simulate(scenario)}
+    plot(courses).savefig(figure, dpi=120)
 
 
 if __name__ == "__main__":
-    main(prog_name="python -m vtbdrake_diagrams.satellite.studies.trajectory")
+    # Under its own name, so that kept pairs have one class.
+    from vtbdrake_diagrams.satellite.studies.trajectory import main as program
+
+    program(prog_name="python -m vtbdrake_diagrams.satellite.studies.trajectory")

@@ -16,10 +16,15 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import BASE, DEVIATION, PLAN
 from vtbdrake_diagrams.satellite.studies.trajectory import (
     Comparison,
     Course,
+    Outcome,
+    Pair,
     Survey,
     TrajectoryAnswer,
     compare,
+    compare_pair,
+    kept_comparisons,
     plot,
+    random_pairs,
     random_scenarios,
     search_problem,
     simulate,
@@ -42,7 +47,7 @@ def test_full_testbed_tends_to_the_momentum_model():
         config.time_step = step
         scenario = ArmMotionScenario(thinking_time=0.2, plant_config=config)
         knots = bent(scenario)
-        errors.append(simulate(scenario, knots).end - scenario.move().motion(knots).angle[-1])
+        errors.append(simulate(scenario, knots).outcome.end - scenario.move().motion(knots).angle[-1])
     assert abs(errors[0]) < np.radians(0.05)
     assert errors[1] / errors[0] == pytest.approx(0.5, abs=0.1)
 
@@ -107,7 +112,7 @@ def test_search_in_the_full_testbed_starts_from_the_straight_path():
     problem = search_problem(scenario)
     straight = scenario.move().straight[2:-2].ravel()
     result = problem.rollout({p.address: value for p, value in zip(problem.parameters, straight, strict=True)})
-    assert result.value == pytest.approx(simulate(scenario).end, abs=1e-9)
+    assert result.value == pytest.approx(simulate(scenario).outcome.end, abs=1e-9)
     assert max(result.measures) <= 0.0
     assert problem.objectives[0] is DEVIATION
 
@@ -137,21 +142,51 @@ def course() -> Course:
     return replace(found, **series)
 
 
-def test_a_comparison_tells_what_exceeds_a_limit(course):
-    assert Comparison(course, course).within_limits
-    half = replace(course, deviations=0.5 * course.deviations)
-    assert not Comparison(half, course).within_limits
-    assert Comparison(course, half).factor == pytest.approx(2.0)
+@pytest.fixture(scope="module")
+def outcome(course: Course) -> Outcome:
+    return course.outcome
+
+
+def turned_less(outcome: Outcome, factor: float) -> Outcome:
+    """Return an outcome whose deviations are smaller by a factor."""
+    smaller = {name: getattr(outcome, name) / factor for name in ("end", "largest", "integral")}
+    return replace(outcome, **smaller)
+
+
+def test_a_comparison_tells_what_exceeds_a_limit(outcome):
+    assert Comparison(outcome, outcome).within_limits
+    half = turned_less(outcome, 2.0)
+    assert not Comparison(half, outcome).within_limits
+    assert Comparison(outcome, half).factor == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("change", [{"rate": 1.2}, {"torque": 1.2}, {"miss": 0.01}, {"clearance": 0.005}])
+def test_each_limit_of_a_plan_counts(change, outcome):
+    assert not Comparison(outcome, replace(outcome, **change)).within_limits
 
 
 def test_a_motion_through_the_panel_is_not_within_the_limits(course):
     positions = course.positions.copy()
     positions[10] = 2.2, 1.0, 2.8, 1.8, 0.9, 0.1, -2.4
-    colliding = replace(course, positions=positions)
-    assert course.nearest[0] > 0.02
-    assert colliding.nearest[0] < 0.0
-    assert "panel" in colliding.nearest[1]
-    assert not Comparison(course, colliding).within_limits
+    colliding = replace(course, positions=positions).outcome
+    assert course.outcome.clearance > 0.02
+    assert colliding.clearance < 0.0
+    assert "panel" in colliding.nearest
+    assert not Comparison(course.outcome, colliding).within_limits
+
+
+def test_outcome_reads_the_course(course):
+    short = replace(
+        course,
+        times=np.array([0.0, 1.0, 3.0]),
+        deviations=np.array([0.0, 0.4, 0.2]),
+        rates=np.array([0.1, 0.5]),
+        torques=np.array([0.7, 0.2]),
+        goal=course.positions[-1] + [0.0, 0.0, -0.03, 0.0, 0.0, 0.0, 0.02],
+    ).outcome
+    assert (short.end, short.largest, short.rate, short.torque) == (0.2, 0.4, 0.5, 0.7)
+    assert short.integral == pytest.approx(0.8)
+    assert short.miss == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize(
@@ -164,16 +199,16 @@ def test_a_motion_through_the_panel_is_not_within_the_limits(course):
         ([5.0] * 20, False),
     ],
 )
-def test_the_answer_can_be_no(factors, holds, course):
-    comparisons = [Comparison(course, replace(course, deviations=course.deviations / factor)) for factor in factors]
+def test_the_answer_can_be_no(factors, holds, outcome):
+    comparisons = [Comparison(outcome, turned_less(outcome, factor)) for factor in factors]
     survey = Survey(tuple(comparisons))
     assert survey.holds == holds
     assert survey.median == pytest.approx(np.median(factors))
     assert survey.successes == sum(factor > 10.0 for factor in factors)
     assert f"{survey.successes} reach 10" in str(survey)
     # One plan beyond a limit is enough.
-    fast = replace(comparisons[0].best, rates=1.2 * np.ones(7))
-    assert not Survey((*comparisons[1:], Comparison(course, fast))).holds
+    fast = replace(comparisons[0].best, rate=1.2)
+    assert not Survey((*comparisons[1:], Comparison(outcome, fast))).holds
 
 
 @pytest.mark.parametrize(
@@ -185,29 +220,47 @@ def test_the_answer_can_be_no(factors, holds, course):
         (30.0, 8.0, 9.0, False),
     ],
 )
-def test_each_kind_of_motion_has_a_verdict(reaching, anywhere, onboard, holds, course):
+def test_each_kind_of_motion_has_a_verdict(reaching, anywhere, onboard, holds, outcome):
     def turned(factor):
         # A worse plan has to be judged by its end alone.
-        deviations = course.deviations.copy()
-        deviations[-1] /= factor
-        return Comparison(course, replace(course, deviations=deviations))
+        return Comparison(outcome, replace(outcome, end=outcome.end / factor))
 
-    kinds = [Survey((turned(factor),) * 20) for factor in (reaching, anywhere)]
-    answer = TrajectoryAnswer(*kinds, turned(onboard))
+    factors = reaching, anywhere
+    pairs = {Pair(k, (), ()): turned(factors[k % 2]) for k in range(40)}
+    answer = TrajectoryAnswer.of(pairs, turned(onboard))
     assert answer.holds == holds
     shown = "a factor of 10 holds" if anywhere > 10.0 else "a factor of 10 is NOT shown"
-    assert f"From any pose to any ({shown})" in verdicts(*kinds)
-    fast = Comparison(course, replace(course, rates=1.2 * np.ones(7)))
+    assert f"From any pose to any ({shown})" in verdicts(answer.reaching, answer.anywhere)
+    fast = Comparison(outcome, replace(outcome, rate=1.2))
     assert not replace(answer, onboard=fast).holds
-    assert not replace(answer, anywhere=Survey((*kinds[1].comparisons, fast))).holds
+    assert not replace(answer, anywhere=Survey((*answer.anywhere.comparisons, fast))).holds
 
 
-def test_largest_deviation_and_integral_are_ratios_to_the_straight_path(course):
-    half = replace(course, deviations=0.5 * course.deviations)
-    survey = Survey((Comparison(course, half),) * 3)
+def test_largest_deviation_and_integral_are_ratios_to_the_straight_path(outcome):
+    survey = Survey((Comparison(outcome, turned_less(outcome, 2.0)),) * 3)
     assert survey.disturbance == pytest.approx({"largest": 0.5, "integral": 0.5})
-    level = replace(course, times=np.array([0.0, 1.0, 3.0]), deviations=np.array([0.0, 0.2, 0.4]))
-    assert level.integral == pytest.approx(0.7)
+
+
+def test_comparisons_agree_within_a_twentieth_or_a_hundredth_of_a_degree(outcome):
+    comparison = Comparison(outcome, turned_less(outcome, 50.0))
+    worse = replace(comparison.best, end=comparison.best.end + 1e-4)
+    assert comparison.agrees(replace(comparison, best=worse))
+    assert not comparison.agrees(replace(comparison, best=turned_less(outcome, 30.0)))
+    assert not comparison.agrees(replace(comparison, straight=turned_less(outcome, 1.1)))
+    assert not comparison.agrees(replace(comparison, best=replace(comparison.best, rate=1.2)))
+
+
+def test_kept_pairs_are_the_first_random_ones():
+    kept = kept_comparisons()
+    assert len(kept) >= 100
+    assert random_pairs(3) == list(kept)[:3]
+    assert [pair.number for pair in kept] == list(range(len(kept)))
+
+
+@pytest.mark.slow
+def test_kept_pair_comes_out_again():
+    pair, comparison = next(iter(kept_comparisons().items()))
+    assert comparison.agrees(compare_pair(pair))
 
 
 @pytest.mark.parametrize(

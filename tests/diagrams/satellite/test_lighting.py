@@ -19,7 +19,14 @@ from vtbdrake_diagrams.satellite.relative_motion import RELATIVE
 from vtbdrake_diagrams.satellite.studies.grips import FAILURE, bar_error, time_to_grip
 from vtbdrake_diagrams.satellite.studies.light_answer import ACCURACY, LightingAnswer
 from vtbdrake_diagrams.satellite.studies.light_campaign import RACE_BUDGET, Campaign, Race, Screening
-from vtbdrake_diagrams.satellite.studies.light_captures import Capture, KeptCaptures, Key, Results, agree
+from vtbdrake_diagrams.satellite.studies.light_captures import (
+    Capture,
+    KeptCaptures,
+    Key,
+    Results,
+    agree,
+    simulate_capture,
+)
 from vtbdrake_diagrams.satellite.studies.light_cases import (
     BY_HAND,
     CANDIDATES,
@@ -201,10 +208,7 @@ def test_kept_captures_are_complete() -> None:
 def test_kept_capture_comes_out_again() -> None:
     captures = Results.read().captures
     key = TODAY, next(case for case in SCREENED_ON if case.light.startswith("beside"))
-    problem = lighting_problem([key[1]])
-    anew: dict[Key, Capture] = {}
-    list(KeptCaptures(anew, keep=lambda: None).run(problem.task, [problem.values(TODAY, condition=0)]))
-    assert agree(captures[key], anew[key])
+    assert agree(captures[key], simulate_capture(key))
 
 
 def test_captures_agree_within_a_sample() -> None:
