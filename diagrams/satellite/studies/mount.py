@@ -704,7 +704,8 @@ def mount(full: bool) -> Answer:
         held_out=f"{len(JUDGED_ON)} others at the same rates",
         baseline=f"{result.well_aimed.name}, {result.well_aimed.rule}: the best by hand",
         holds=result.holds and repetition.same,
-        note=f"Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing. {repetition}.",
+        note=f"Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing. "
+        f"{repetition}.",
     )
 
 
