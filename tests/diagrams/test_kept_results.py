@@ -78,6 +78,5 @@ def test_seed_draws_the_same_results_again() -> None:
     assert len(others) > 1
 
 
-@pytest.mark.slow
 def test_processes_give_results_in_the_order_of_the_cases() -> None:
     assert list(in_processes(abs, [-3, 1, -2], workers=2)) == [(-3, 3), (1, 1), (-2, 2)]
