@@ -73,7 +73,7 @@ class Repetition:
 
     Attributes:
         kind: What they are results of, in the plural: "captures".
-        kept: The number of kept results.
+        total: The number of kept results.
         count: The number of results that were made again.
         seed: The seed by which these were drawn.
         different: The cases whose result is another one now, in words.
@@ -81,7 +81,7 @@ class Repetition:
     """
 
     kind: str
-    kept: int
+    total: int
     count: int
     seed: int
     different: tuple[str, ...]
@@ -97,12 +97,12 @@ class Repetition:
         if self.different:
             but = f"as kept but for at most {self.allowed}" if self.same else "OTHERS than kept"
             outcome = f"{but}: {'; '.join(self.different)}"
-        return f"{self.count} of {self.kept} kept {self.kind} simulated again (drawn by seed {self.seed}): {outcome}"
+        return f"{self.count} of {self.total} kept {self.kind} simulated again (drawn by seed {self.seed}): {outcome}"
 
 
 def repeat(
     kind: str,
-    kept: Mapping[_Case, _Result],
+    results: Mapping[_Case, _Result],
     function: Callable[[_Case], _Result],
     agree: Callable[[_Result, _Result], bool],
     *,
@@ -115,7 +115,7 @@ def repeat(
 
     Args:
         kind: What they are results of, in the plural.
-        kept: The results by case; a case in words is its text.
+        results: The kept results by case; a case in words is its text.
         function: A function of a module that makes the result of a case.
         agree: Returns whether a kept result and a new one are the same, but for rounding on another processor.
         share: The share of the cases that is drawn; at least one case is.
@@ -125,9 +125,9 @@ def repeat(
         workers: The number of processes, see `in_processes`.
     """
     seed = secrets.randbelow(2**32) if seed is None else seed
-    cases = list(kept)
+    cases = list(results)
     numbers = np.random.default_rng(seed).choice(len(cases), ceil(share * len(cases)), replace=False)
     drawn = [cases[number] for number in sorted(numbers.tolist())]
     again = in_processes(function, drawn, workers=workers)
-    different = tuple(str(case) for case, result in again if not agree(kept[case], result))
+    different = tuple(str(case) for case, result in again if not agree(results[case], result))
     return Repetition(kind, len(cases), len(drawn), seed, different, floor(allowed * len(drawn)))

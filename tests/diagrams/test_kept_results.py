@@ -57,7 +57,7 @@ def near(before: float, now: float) -> bool:
 
 def test_a_tenth_is_made_again_and_is_the_same() -> None:
     repetition = repeat("squares", SQUARES, square, near, workers=1)
-    assert (repetition.count, repetition.kept, repetition.same) == (3, 30, True)
+    assert (repetition.count, repetition.total, repetition.same) == (3, 30, True)
     assert str(repetition) == f"3 of 30 kept squares simulated again (drawn by seed {repetition.seed}): as kept"
 
 

@@ -612,8 +612,8 @@ def answer_mount(
 def captures_again(answer: MountAnswer) -> Repetition:
     """Judge the placements on a tenth of the captures again, and return whether the mean counts are the same."""
     looks = [(placement.pose, placement.judged) for placement in answer.judged if placement.judged is not None]
-    kept = {number: np.array([look.means[number] for _, look in looks]) for number in range(len(JUDGED_ON))}
-    return repeat("captures", kept, partial(mean_counts, tuple(pose for pose, _ in looks)), agree)
+    counts = {number: np.array([look.means[number] for _, look in looks]) for number in range(len(JUDGED_ON))}
+    return repeat("captures", counts, partial(mean_counts, tuple(pose for pose, _ in looks)), agree)
 
 
 def mean_counts(poses: Sequence[Array], number: int) -> Array:

@@ -457,12 +457,12 @@ def continue_campaign(
 
 def approaches_again(answer: FrequencyAnswer) -> Repetition:
     """Simulate a tenth of the kept approaches again, and return whether they come out the same, but for `ROUNDED`."""
-    kept = {
+    by_approach = {
         Approach(*key, start): error
         for key, errors in sorted(answer.errors.items())
         for start, error in zip(STARTS, errors, strict=False)
     }
-    return repeat("approaches", kept, approach_error, agree, allowed=ROUNDED)
+    return repeat("approaches", by_approach, approach_error, agree, allowed=ROUNDED)
 
 
 @dataclass(frozen=True)

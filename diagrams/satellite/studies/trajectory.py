@@ -474,13 +474,13 @@ def survey(count: int, *, echo: Callable[[str], Any] = lambda line: None, worker
         echo: Gets a line for each new pair, in their order.
         workers: The number of processes; by default one per core.
     """
-    pairs, kept = random_pairs(count), kept_comparisons()
-    missing = [pair for pair in pairs if pair not in kept]
+    pairs, comparisons = random_pairs(count), kept_comparisons()
+    missing = [pair for pair in pairs if pair not in comparisons]
     for pair, comparison in in_processes(compare_pair, missing, workers=workers):
-        kept[pair] = comparison
-        keep_comparisons(kept)
+        comparisons[pair] = comparison
+        keep_comparisons(comparisons)
         echo(f"{pair}: {comparison}")
-    return Survey(tuple(kept[pair] for pair in pairs))
+    return Survey(tuple(comparisons[pair] for pair in pairs))
 
 
 def answer(full: bool) -> Answer:
@@ -491,9 +491,9 @@ def answer(full: bool) -> Answer:
     """
     if full:
         survey(_PAIRS_FULL)
-    kept = kept_comparisons()
-    repetitions = repeat("pairs", kept, compare_pair, Comparison.agrees), captures_again()
-    result = TrajectoryAnswer.of(kept, compare(ArmMotionScenario(onboard=True)))
+    comparisons = kept_comparisons()
+    repetitions = repeat("pairs", comparisons, compare_pair, Comparison.agrees), captures_again()
+    result = TrajectoryAnswer.of(comparisons, compare(ArmMotionScenario(onboard=True)))
     onboard, anywhere = result.onboard, result.anywhere
     turned = np.degrees([onboard.straight.end, onboard.best.end])
     lower, upper = anywhere.interval
@@ -508,7 +508,7 @@ def answer(full: bool) -> Answer:
         interval=result.reaching.interval,
         paper="none given",
         cases="the momentum model, for each motion anew",
-        held_out=f"the full testbed, {len(kept)} random motions and the one that the DPS decides on board",
+        held_out=f"the full testbed, {len(comparisons)} random motions and the one that the DPS decides on board",
         baseline="the straight path in joint space",
         holds=result.holds and all(repetition.same for repetition in repetitions),
         note=(
