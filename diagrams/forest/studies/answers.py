@@ -15,7 +15,7 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies import fusion, revised_maps
+from vtbdrake_diagrams.forest.studies import fusion, on_foot, revised_maps, trees_and_rocks
 from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     REACH,
@@ -118,7 +118,8 @@ def localization(full: bool) -> Answer:
     """Answer C2: how accurately does the unit localize itself?
 
     The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20. The unit with scanner and
-    cameras (`fusion`) and the one that revises its map (`revised_maps`) were driven before.
+    cameras (`fusion`), the one that revises its map (`revised_maps`), the one on foot (`on_foot`) and the one with
+    rocks as landmarks (`trees_and_rocks`) were moved before.
     """
     drives = Drives(length=500.0 if full else 25.0)
     seeds = range(SEED, SEED + (20 if full else 4))
@@ -149,7 +150,13 @@ def localization(full: bool) -> Answer:
         + ("the pose is the same. " if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}. ")
         + _fused(fused)
         + " "
-        + revised_maps.in_words(revised_maps.load()),
+        + " ".join(
+            (
+                revised_maps.in_words(revised_maps.load()),
+                on_foot.in_words(on_foot.load()),
+                trees_and_rocks.in_words(on_foot.load(trees_and_rocks.FILE)),
+            )
+        ),
     )
 
 

@@ -205,8 +205,18 @@ class WaySummary:
 
     def meets_goal(self, name: str) -> bool:
         """Return whether error, share of poses, claims and NEES meet the criteria, with a map of this name."""
-        is_sure = self.localized >= LEAST_LOCALIZED and not self.wrong
-        return self.rms <= GOALS[name].position and is_sure and self.last_nees <= self.bounds[1]
+        return not self.missed(name)
+
+    def missed(self, name: str) -> str:
+        """Return which of these criteria are missed, in words; nothing if all are met."""
+        goal, bound = GOALS[name].position, self.bounds[1]
+        reasons = {
+            f"an error above {goal:g} m": not self.rms <= goal,
+            f"a pose in less than {LEAST_LOCALIZED:.0%}": self.localized < LEAST_LOCALIZED,
+            f"{self.wrong} wrong claims": self.wrong > 0,
+            f"NEES {self.last_nees:.2f} above {bound:.2f}": not self.last_nees <= bound,
+        }
+        return " and ".join(reason for reason, is_missed in reasons.items() if is_missed)
 
 
 def summary(ways: Ways, variant: str, name: str) -> WaySummary:
@@ -287,12 +297,17 @@ def in_words(ways: Ways) -> str:
             f"{'in the hand' if carrier == 'hand' else 'on the back'} {errors}, a pose in "
             f"{min(of.localized for of in each):.0%}, {sum(of.wrong for of in each)} wrong claims"
         )
+    misses = [
+        f"{carrier} with the {name} map: {reason}"
+        for carrier, name in product(CARRIERS[1:], MAP_NAMES)
+        if (reason := summary(ways, carrier, name).missed(name))
+    ]
     machine = ", ".join(f"{summary(ways, 'machine', name).rms:.3f} m" for name in MAP_NAMES)
     reckoned = summary(ways, "hand", "accurate").reckoned
     return (
         f"Carried by a worker on foot through {len(ways)} other forests it errs by (RMS) {'; '.join(parts)}. Dead "
         f"reckoning by steps alone errs by {reckoned:.2f} m, the machine in the same forests by {machine}. The "
-        f"criteria on foot: {_word(holds(ways))}."
+        f"criteria on foot: {'all met' if holds(ways) else 'NOT met, ' + '; '.join(misses)}."
     )
 
 

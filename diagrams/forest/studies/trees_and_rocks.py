@@ -105,9 +105,8 @@ def in_words(ways: Ways) -> str:
     parts = []
     for variant, name in product(LANDMARKS, MAP_NAMES):
         each = summary(ways, variant, name)
-        wrong = f", {each.wrong} wrong claims" if each.wrong else ""
-        verdict = "" if each.meets_goal(name) else " (criteria NOT met)"
-        parts.append(f"{variant} {name} {each.rms:.3f} m in {each.localized:.0%}{wrong}{verdict}")
+        verdict = f" (NOT met: {each.missed(name)})" if each.missed(name) else ""
+        parts.append(f"{variant} {name} {each.rms:.3f} m in {each.localized:.0%}{verdict}")
     verdicts = [f"{name}: {'no worse' if both_no_worse(ways, name) else 'WORSE'}" for name in MAP_NAMES]
     return (
         f"By trunks, by rocks and by both as landmarks, in {len(ways)} other forests with rocks, RMS and share of "

@@ -10,8 +10,9 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.unit import SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.scenario import CARRIERS, LANDMARKS
+from vtbdrake_diagrams.forest.studies import on_foot, trees_and_rocks
 from vtbdrake_diagrams.forest.studies.drives import Drive, Track
-from vtbdrake_diagrams.forest.studies.on_foot import MAP_NAMES, Way, carried, holds, judged, summary
+from vtbdrake_diagrams.forest.studies.on_foot import MAP_NAMES, Way, carried, holds, judged, load, report, summary
 from vtbdrake_diagrams.forest.studies.trees_and_rocks import both_no_worse, with_landmarks
 
 pytestmark = pytest.mark.one_python
@@ -73,6 +74,8 @@ def test_errors_are_counted_beside_dead_reckoning() -> None:
 def test_each_criterion_counts(changes: dict[str, object]) -> None:
     assert holds(ways())
     assert not holds(ways(**changes))
+    assert "all met" in on_foot.in_words(ways())
+    assert "NOT met" in on_foot.in_words(ways(**changes))
 
 
 def test_machine_has_no_criterion() -> None:
@@ -107,3 +110,15 @@ def test_both_kinds_must_not_be_worse_than_trunks() -> None:
     assert both_no_worse(ways(tuple(LANDMARKS)), "accurate")
     assert not both_no_worse(ways(tuple(LANDMARKS), rms=0.04), "accurate")
     assert not both_no_worse(ways(tuple(LANDMARKS), poses=93), "accurate")
+
+
+@pytest.mark.parametrize(
+    ("module", "variants"), [(on_foot, CARRIERS), (trees_and_rocks, tuple(LANDMARKS))], ids=["on_foot", "rocks"]
+)
+def test_kept_results_are_complete(module: object, variants: tuple[str, ...]) -> None:
+    kept = load(module.FILE)  # type: ignore[attr-defined]
+    assert list(kept) == list(range(module.SEED, module.SEED + module.FORESTS))  # type: ignore[attr-defined]
+    for cases in kept.values():
+        assert [(case.variant, case.map) for case in cases] == [(v, name) for v in variants for name in MAP_NAMES]
+    assert str(module.FORESTS) in report(kept, variants)  # type: ignore[attr-defined]
+    assert "RMS" in module.in_words(kept)  # type: ignore[attr-defined]
