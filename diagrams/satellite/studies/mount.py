@@ -15,6 +15,9 @@ The choices that influence the answer were fixed before the first placement was 
 * the search: the best of each rule, `GLOBAL` placements by the default solver, then `LOCAL` by NLopt's COBYLA
   in Drake's MathematicalProgram, from the best so far.
 
+Whether a search with more placements finds a better one is asked by ``--search``: it is judged on captures on which
+nothing else was judged, `LONG_JUDGED_ON`.
+
 Beside the count of markers, every image gives a pose of the target, or none: how far that pose has the bar off is
 judged, too. At last the placements judged guide captures themselves, without wheels.
 
@@ -87,8 +90,15 @@ GUIDED_HORIZON = 36.0
 """How long a capture that the camera guides may take, in s."""
 GUIDED_RATE = 2.5
 """The images per second of a camera that guides, in Hz: less than usual, because images are what a capture costs."""
+LONG_GLOBAL = 40
+"""The number of placements that the default solver tries in the long search."""
+LONG_LOCAL = 40
+"""The number of placements that COBYLA tries after them."""
 RESULTS = Path(__file__).with_suffix(".json")
 """The results that ``--full`` keeps."""
+LONG_RESULTS = Path(__file__).with_name("mount_search.json")
+"""The results that ``--search`` keeps."""
+LONG_COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --search"
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --full"
 
 # The least place of the camera along x of B, in m: 2 cm before the front face; a bracket reaches 10 cm farther.
@@ -132,6 +142,8 @@ FOUND_ON = captures(0, 5)
 """The captures on which placements are found."""
 JUDGED_ON = captures(100, 20)
 """The captures on which they are judged."""
+LONG_JUDGED_ON = captures(200, 20)
+"""The captures on which the long search is judged; nothing else was judged on them."""
 
 
 def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
@@ -472,9 +484,7 @@ class MountAnswer:
         """
         beside = (placement or self.well_aimed).judged
         assert self.best.judged is not None and beside is not None
-        gains = self.best.judged.means - beside.means
-        half = float(student.ppf(0.95, len(gains) - 1) * gains.std(ddof=1) / np.sqrt(len(gains)))
-        return float(gains.mean()) - half, float(gains.mean()), float(gains.mean()) + half
+        return mean_gain(self.best.judged, beside)
 
     @property
     def verdict(self) -> str:
@@ -505,6 +515,66 @@ class MountAnswer:
         grid = {key: np.array(values, dtype=float) for key, values in stored["grid"].items()}
         placements = tuple(Placement.of(placement) for placement in stored["placements"])
         return MountAnswer(placements, stored["candidates"], stored["status"], grid)
+
+
+def mean_gain(look: Look, beside: Look) -> tuple[float, float, float]:
+    """Return by how many markers one placement sees more than another in the mean, and the interval of 90 %.
+
+    Returns:
+        (lower, mean, upper), by Student's t of the differences in each capture.
+    """
+    gains = look.means - beside.means
+    half = float(student.ppf(0.95, len(gains) - 1) * gains.std(ddof=1) / np.sqrt(len(gains)))
+    return float(gains.mean()) - half, float(gains.mean()), float(gains.mean()) + half
+
+
+@dataclass(frozen=True, eq=False)
+class LongSearch:
+    """A search that tries more placements, and is judged on captures of its own, `LONG_JUDGED_ON`.
+
+    Attributes:
+        pose: The best pose on `FOUND_ON`, (6,), in m and rad.
+        candidates: How many placements were tried.
+        status: How COBYLA ended, in its own words.
+        tried: What the best pose sees in `FOUND_ON`.
+        judged: What it sees in `LONG_JUDGED_ON`.
+        by_hand: What the best placement by hand sees there.
+    """
+
+    pose: Array
+    candidates: int
+    status: str
+    tried: Look
+    judged: Look
+    by_hand: Look
+
+    @staticmethod
+    def of(stored: Mapping[str, Any]) -> LongSearch:
+        """Return what was kept."""
+        looks = (Look.of(stored[name]) for name in ("tried", "judged", "by_hand"))
+        return LongSearch(np.array(stored["pose"]), stored["candidates"], stored["status"], *looks)
+
+    def __str__(self) -> str:
+        lower, mean, upper = mean_gain(self.judged, self.by_hand)
+        return (
+            f"A search of {self.candidates} placements sees {self.tried.mean:.2f} markers where it was found, and on "
+            f"{len(self.judged.means)} captures of its own {self.judged.mean:.2f}, {mean:+.2f} [{lower:.2f}, "
+            f"{upper:.2f}] beside the best by hand"
+        )
+
+
+def long_search(answer: MountAnswer) -> LongSearch:
+    """Search from the best placement of each rule with more placements, and judge the best on `LONG_JUDGED_ON`.
+
+    Args:
+        answer: The placements by hand.
+    """
+    onlooker = Onlooker(FOUND_ON)
+    starts = [placement.pose for placement in judged_placements(answer.placements) if placement.rule != SEARCH]
+    pose, candidates, status = search_mount(onlooker.problem, starts, first=LONG_GLOBAL, then=LONG_LOCAL)
+    judge = Onlooker(LONG_JUDGED_ON)
+    looks = judge.look(pose), judge.look(answer.well_aimed.pose)
+    return LongSearch(pose, candidates, status, onlooker.look(pose), *looks)
 
 
 def search_mount(
@@ -568,7 +638,7 @@ def try_placements(echo: Callable[[str], Any] = print) -> MountAnswer:
             echo(f"{name}, {rule}: {tried[-1].tried.mean:.2f}")
     value, candidates, status = search_mount(onlooker.problem, [p.pose for p in judged_placements(tried)])
     best = Placement(SEARCH, SEARCH, value, onlooker.look(value))
-    echo(f"{_place(best)}: {best.tried.mean:.2f} of {candidates}; {status}")
+    echo(f"{_place(best.pose)}: {best.tried.mean:.2f} of {candidates}; {status}")
     return MountAnswer((best, *tried), candidates, status, {})
 
 
@@ -690,13 +760,14 @@ def mount(full: bool) -> Answer:
     random.
     """
     result = answer_mount() if full else MountAnswer.of(read_results(RESULTS))
+    longer = long_search(result) if full else LongSearch.of(read_results(LONG_RESULTS))
     repetition = captures_again(result)
     lower, mean, upper = result.gain()
     looks = "; ".join(_words(placement) for placement in result.judged)
     return Answer(
         id="O1",
         question="Where should the docking camera sit to see the most markers during the capture?",
-        answer=f"{_place(result.best)}: {mean:+.2f} markers beside the best by hand; {result.verdict}",
+        answer=f"{_place(result.best.pose)}: {mean:+.2f} markers beside the best by hand; {result.verdict}",
         unit="",
         interval=(lower, upper),
         paper="none given",
@@ -704,7 +775,7 @@ def mount(full: bool) -> Answer:
         held_out=f"{len(JUDGED_ON)} others at the same rates",
         baseline=f"{result.well_aimed.name}, {result.well_aimed.rule}: the best by hand",
         holds=result.holds and repetition.same,
-        note=f"Interval: of 90 %, of the markers more. {looks}. Differences under {TELLING} mean nothing. "
+        note=f"Interval: of 90 %, of the markers more. {looks}. {longer}. Differences under {TELLING} mean nothing. "
         f"{repetition}.",
     )
 
@@ -718,10 +789,10 @@ def _words(placement: Placement) -> str:
     ) + ("" if guided is None else f"; guides {guided.successes} of {len(guided.times)} captures")
 
 
-def _place(placement: Placement) -> str:
-    """Return where a placement is, and where it looks."""
-    camera = _ENTRIES.view(placement.pose)
-    ahead, left, up = pose_from_array(placement.pose).rotation().matrix()[:, 2]
+def _place(value: Array) -> str:
+    """Return where a camera with this pose is, and where it looks."""
+    camera = _ENTRIES.view(value)
+    ahead, left, up = pose_from_array(value).rotation().matrix()[:, 2]
     side = "left" if left >= 0.0 else "right"
     return (
         f"at x = {camera.x:.2f}, y = {camera.y:.2f}, z = {camera.z:.2f} m, "
@@ -733,8 +804,9 @@ def _place(placement: Placement) -> str:
 
 @click.command()
 @click.option("--full", is_flag=True, help="Do what is missing in the kept results first, and keep it.")
+@click.option("--search", is_flag=True, help="Search with more placements, and keep what is found.")
 @click.option("--figure", default="mount.png", help="File of the picture.", show_default=True)
-def main(full: bool, figure: str) -> None:
+def main(full: bool, search: bool, figure: str) -> None:
     """Answer O1, and draw the answer."""
     result = MountAnswer.of(read_results(RESULTS)) if RESULTS.exists() else None
     if full or result is None:
@@ -743,8 +815,13 @@ def main(full: bool, figure: str) -> None:
         click.echo(f"{placement.name}, {placement.rule}: {placement.tried.mean:.2f} where they were found")
     for placement in result.judged:
         click.echo(f"{_words(placement)}; the one found sees {_gain(result, placement)} more")
-    click.echo(f"found {_place(result.best)} by {result.candidates} placements ({result.status})")
+    click.echo(f"found {_place(result.best.pose)} by {result.candidates} placements ({result.status})")
     click.echo(f"{result.verdict}; holds: {result.holds}")
+    if search:
+        write_results(LONG_RESULTS, long_search(result), command=LONG_COMMAND)
+    if LONG_RESULTS.exists():
+        longer = LongSearch.of(read_results(LONG_RESULTS))
+        click.echo(f"{longer}: {_place(longer.pose)}; {longer.status}")
     plot_answer(result).savefig(figure, dpi=110)
 
 

@@ -21,6 +21,7 @@ from vtbdrake_diagrams.satellite.studies.mount import (
     FOUND_ON,
     HORIZON,
     JUDGED_ON,
+    LONG_JUDGED_ON,
     PARAMETERS,
     POSE,
     RULES,
@@ -30,6 +31,7 @@ from vtbdrake_diagrams.satellite.studies.mount import (
     TUMBLES,
     TURNED,
     Guided,
+    LongSearch,
     Look,
     MountAnswer,
     Onlooker,
@@ -233,6 +235,21 @@ def test_kept_answer_comes_back(tmp_path):
     np.testing.assert_array_equal(after.best.guided.errors, guided.errors)
     assert after.best.guided.successes == 1
     assert [p.judged is None for p in after.placements] == [p.judged is None for p in before.placements]
+
+
+def test_long_search_comes_back_and_tells_its_gain(tmp_path):
+    before = LongSearch(pose(0.1, 0.0), 82, "", look(5.0, 5), look(4.9), look(4.6))
+    write_results(tmp_path / "search.json", before, command="make it")
+    after = LongSearch.of(read_results(tmp_path / "search.json"))
+    np.testing.assert_array_equal(after.pose, before.pose)
+    assert "82 placements" in str(after)
+    assert "20 captures of its own 4.91, +0.30 [0.30, 0.30]" in str(after)
+
+
+def test_long_search_is_judged_on_captures_of_its_own():
+    others = {capture.seed for capture in (*FOUND_ON, *JUDGED_ON)}
+    assert not others & {capture.seed for capture in LONG_JUDGED_ON}
+    assert {capture.tumble_deg for capture in LONG_JUDGED_ON} == set(TUMBLES)
 
 
 DAMPING = "sim.sys.Pendulum.theta.damping"
