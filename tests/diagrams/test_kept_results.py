@@ -37,7 +37,8 @@ def test_missing_file_names_its_remedy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "study", ["mount", "scan_frequency", "scanned_captures", "lighting", "trajectory", "planned_capture"]
+    "study",
+    ["mount", "mount_search", "scan_frequency", "scanned_captures", "lighting", "trajectory", "planned_capture"],
 )
 def test_results_of_the_studies_have_their_digest(study: str) -> None:
     folder = Path(__file__).resolve().parents[2] / "diagrams/satellite/studies"
