@@ -83,7 +83,8 @@ RESULTS = Path(__file__).with_suffix(".json")
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.scan_frequency --full"
 ROUNDED = 0.15
 """The share of repeated simulations that may come out differently. Registration starts where the track is, so that
-rounding grows: of 136 approaches that were simulated again on a later day, four differed by more than `agree` allows."""
+rounding grows: of 136 approaches that were simulated again on a later day, four differed by more than `agree`
+allows."""
 QUANTILE = 0.9
 """The share of approaches in which a sufficient frequency keeps the error within the tolerance."""
 CONFIDENCE = 0.9
