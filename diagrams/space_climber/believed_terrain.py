@@ -163,6 +163,15 @@ class BelievedTerrain:
         """Return the gradients of the believed heights at the vertices, shape (2, n, m)."""
         return np.stack(np.gradient(self.ground.heights, self.ground.cell))
 
+    def steepness(self) -> Array:
+        """Return the slopes (rise over run) of the cells between the vertices, shape (n - 1, m - 1).
+
+        On the bottom of a gully the slopes of both banks cancel each other at a vertex, as `slopes` has them, but not
+        in the cells.
+        """
+        along_x, along_y = (np.diff(self.ground.heights, axis=axis) / self.ground.cell for axis in range(2))
+        return np.hypot(0.5 * (along_x[:, 1:] + along_x[:, :-1]), 0.5 * (along_y[1:] + along_y[:-1]))
+
     def world_model(
         self,
         *,

@@ -1,10 +1,11 @@
 r"""Routes over believed terrain: the cost from every place to beyond the rim, and the way down that cost.
 
 A metre costs what it takes in time, in metres on level ground: on a slope s with the friction mu the robot advances by
-1 - (s / mu)^3.7 of its steps (`SLIP_EXPONENT`), so a metre costs the inverse of it, `STEEPEST` at most. A rock that is
-higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. Around a
-place where the robot came no further a metre costs `OBSTACLE_COST` more. The costs to the goal are the costs of
-shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths from one place).
+1 - (s / mu)^3.7 of its steps (`SLIP_EXPONENT`), so a metre costs the inverse of it, `STEEPEST` at most. The slope s
+is taken in the cells, so that the bottom of a gully costs what its banks cost. A rock that is higher than the feet are
+lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. Around a place where the robot
+came no further a metre costs `OBSTACLE_COST` more. The costs to the goal are the costs of shortest paths on a grid with
+eight neighbours (Dijkstra; A* finds the same paths from one place).
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ HALF_WIDTH = 0.45
 """From the robot's middle to the outside of its feet, in m."""
 
 OBSTACLE_COST = 8.0
-"""What a metre costs more, in m, where the robot walked before and came no further."""
+"""The additional cost of a metre, in m, where the robot walked before and came no further."""
 
 OBSTACLE_RADIUS = 0.9
-"""How far around such a place, in m: half of its width, and as much again."""
+"""The distance from such a place up to which `OBSTACLE_COST` holds, in m: the robot's width."""
 
 CLEARANCE = 0.1
 """Height up to which the robot steps over a rock, in m."""
@@ -99,9 +100,9 @@ def route(terrain: BelievedTerrain) -> Route:
     count = tuple((size / _STEP).astype(int) + 1)
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij")).astype(float)
     at = nodes * _STEP / ground.cell
-    gradient = np.stack([map_coordinates(g, at, order=1) for g in terrain.slopes()])
+    steepness = map_coordinates(terrain.steepness(), at - 0.5, order=1, mode="nearest")
     friction = map_coordinates(terrain.cautious_friction, at, order=1)
-    share = np.hypot(*gradient) / friction
+    share = steepness / friction
     price = 1.0 / np.maximum(1.0 - share**SLIP_EXPONENT, 1.0 / STEEPEST)
     places = nodes * _STEP + np.array(ground.origin)[:, None, None]
     for rock in terrain.rocks:

@@ -161,6 +161,19 @@ def test_a_route_goes_around_rocks_and_steep_ground() -> None:
     assert over.heading([20.0, 0.0], ahead=5.0) < -0.2
 
 
+def test_a_route_keeps_out_of_a_gully() -> None:
+    """A V along x, 3 m wide and up to 1 m deep: its banks are steep, and at a vertex on its bottom they cancel."""
+    flat = GroundMap.surveyed((-6.0, -34.0), 1.0, np.zeros((55, 69)), deviation=0.3, range=8.0)
+    heights = flat.survey.copy()
+    deep = np.clip((np.arange(-6.0, 49.0) - 14.0) / 6.0, 0.0, 1.0)
+    heights[:, 32:37] -= deep[:, None] * np.maximum(0.0, 1.0 - np.abs(np.arange(-2, 3)) / 1.5)
+    terrain = BelievedTerrain(replace(flat, survey=heights), WorldModel())
+    np.testing.assert_allclose(terrain.steepness()[30, 33:35], 2.0 / 3.0)
+    np.testing.assert_allclose(terrain.slopes()[:, 30, 34], 0.0, atol=1e-12)
+    path = route(terrain).path([12.0, 0.0], length=22.0)
+    assert np.abs(path[path[:, 0] > 22.0, 1]).min() > 1.4
+
+
 def test_a_route_goes_around_where_the_robot_came_no_further() -> None:
     """Around the place it costs 8 m more per metre: the way aside is shorter, with half a robot between."""
     flat = GroundMap.surveyed((-6.0, -34.0), 1.0, np.zeros((55, 69)), deviation=0.3, range=8.0)
