@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from vtbdrake.optimization import Boundary
+from vtbdrake_diagrams.space_climber.studies import perceived
 from vtbdrake_diagrams.space_climber.studies.answers import HeadingAnswer, PayloadAnswer
 from vtbdrake_diagrams.space_climber.studies.perceived import (
     COMPARED,
@@ -18,9 +21,11 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     Crossing,
     Stop,
     Walk,
+    code_without_docstrings,
     crossings,
     digest,
     heading_name,
+    imported_modules,
     judged,
     load,
     older,
@@ -131,6 +136,29 @@ def test_walks_are_kept_in_a_file(tmp_path: Path) -> None:
     path.write_text(path.read_text() + "{}\n")
     with pytest.raises(ValueError, match="line 3 of .* is no walk"):
         load(path)
+
+
+def test_docstrings_and_comments_are_no_part_of_the_code(tmp_path: Path) -> None:
+    path = tmp_path / "module.py"
+    path.write_text('LEG = 20.0\n\n\nclass Stop:\n    def place(self):\n        return "x"\n')
+    code = code_without_docstrings(path)
+    path.write_text(
+        '"""Stops."""\n\nLEG = 20.0  # in s\n"""How long."""\n\n\nclass Stop:\n    """A stop."""\n\n'
+        '    def place(self):\n        """Return the place."""\n        return "x"\n'
+    )
+    assert code_without_docstrings(path) == code
+    path.write_text(path.read_text().replace('"x"', '"y"'))
+    assert code_without_docstrings(path) != code
+
+
+@pytest.mark.slow
+def test_the_digest_is_of_the_modules_that_python_imports() -> None:
+    name = "vtbdrake_diagrams.space_climber.studies.perceived"
+    program = f"import {name}, sys; print(*[m.__file__ for n, m in sys.modules.items() if 'space_climber.' in n])"
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    imported = {Path(file).resolve() for file in output.split() if not file.endswith("__init__.py")}
+    assert len(imported) > 15
+    assert set(imported_modules(Path(perceived.__file__).resolve())) == imported
 
 
 def test_a_crater_is_judged_when_some_fixed_heading_passes_and_all_have_walked() -> None:
