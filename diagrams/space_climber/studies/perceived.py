@@ -738,7 +738,7 @@ def imported_modules(path: Path) -> list[Path]:
 
 
 def code_without_docstrings(path: Path) -> str:
-    """Return the code of a module without comments and docstrings, those of constants included."""
+    """Return the code of a module without comments and docstrings, also of constants and attributes."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(body := getattr(node, "body", None), list):
