@@ -1,7 +1,7 @@
 """The climber that finds its way out of a crater on board: its DPS perceives, builds its world, tries, and acts.
 
 `perceived` judges the decisions in many craters, with a robot that is told from outside when to look and to walk. Here
-the same `Explorer` is a slow part of the DPS, ``head``: ``legs`` stands, asks it, walks a leg or notices that it is
+the same `Explorer` is a slow part of the DPS, ``head``: ``pilot`` stands, asks it, walks a leg or notices that it is
 blocked, and stands again. The DPS has its sensor signals, the scanner's among them, the survey, and the command
 ``explore``. So it is the same in a simulation and beside a loop, where ``head`` works in a process of its own.
 
@@ -64,7 +64,7 @@ EXPLORE = "u.explore"
 """The address of the command to find the way out: 1 to go, 0 to stand."""
 
 PERIOD = 0.2
-"""Period of ``legs`` and ``head`` in s."""
+"""Period of ``pilot`` and ``head`` in s."""
 
 STEP = 0.1
 """How far a first command may be from the measured joints, in rad."""
@@ -84,7 +84,7 @@ _ROUNDING = 1e-6
 
 
 class Phase(IntEnum):
-    """What the legs do."""
+    """What the pilot lets the robot do."""
 
     LOOK = 0
     ASK = 1
@@ -92,12 +92,12 @@ class Phase(IntEnum):
     BACK = 3
 
 
-class Legs(AddressedSystem):
+class Pilot(AddressedSystem):
     """A system that stands, asks where to go, and walks there for a while.
 
     .. pydrake_system::
 
-        name: Legs
+        name: Pilot
         input_ports:
         - pose
         - navigation
@@ -218,7 +218,7 @@ class Head:
 
         Args:
             scan: The last scan.
-            leg: The output ``leg`` of `Legs`.
+            leg: The output ``leg`` of `Pilot`.
             request: The request; its value does not matter.
             dps: The state of the DPS.
             memory: What is believed of the terrain.
@@ -342,10 +342,10 @@ class ExploringScenario(CraterScenario):
         builder = DiagramBuilder()
         impl = add_walker(builder, self.gait, period=self.period, clearance=self.clearance, navigator=True)
         env = builder.GetSubsystemByName("env")
-        legs = builder.AddNamedSystem("legs", Legs())
+        pilot = builder.AddNamedSystem("pilot", Pilot())
         head = SlowPart(
             Head(),
-            inputs={"scan": Scan.empty(), "leg": legs.GetOutputPort("leg").size()},
+            inputs={"scan": Scan.empty(), "leg": pilot.GetOutputPort("leg").size()},
             outputs={"decision": 3, "gain": 1},
             period=PERIOD,
             latency=LATENCY,
@@ -356,17 +356,17 @@ class ExploringScenario(CraterScenario):
             samples_dps=True,
         )
         builder.AddNamedSystem("head", head)
-        builder.Connect(env.GetOutputPort("pose"), legs.GetInputPort("pose"))
-        builder.Connect(impl.GetOutputPort("navigation"), legs.GetInputPort("navigation"))
+        builder.Connect(env.GetOutputPort("pose"), pilot.GetInputPort("pose"))
+        builder.Connect(impl.GetOutputPort("navigation"), pilot.GetInputPort("navigation"))
         for name in ("decision", "sampled_at", "missed"):
-            builder.Connect(head.GetOutputPort(name), legs.GetInputPort(name))
+            builder.Connect(head.GetOutputPort(name), pilot.GetInputPort(name))
         for name in ("leg", "request"):
-            builder.Connect(legs.GetOutputPort(name), head.GetInputPort(name))
+            builder.Connect(pilot.GetOutputPort(name), head.GetInputPort(name))
         for name in ("heading", "walk"):
-            builder.Connect(legs.GetOutputPort(name), impl.GetInputPort(name))
+            builder.Connect(pilot.GetOutputPort(name), impl.GetInputPort(name))
         builder.ExportInput(impl.GetInputPort("visual_odometry"), "visual_odometry")
         builder.ExportInput(head.GetInputPort("scan"), "scan")
-        builder.ExportInput(legs.GetInputPort("explore"), "explore")
+        builder.ExportInput(pilot.GetInputPort("explore"), "explore")
         dps = builder.Build()
         dps.set_name("dps")
         return dps

@@ -1,4 +1,4 @@
-"""The climber whose DPS finds its way out of a crater: its legs, what its head remembers, and both on a machine."""
+"""The climber whose DPS finds its way out of a crater: its pilot, what its head remembers, and both on a machine."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from vtbdrake_diagrams.space_climber.studies.exploring import (
     PERIOD,
     TERRAIN_CODEC,
     ExploringScenario,
-    Legs,
     Phase,
+    Pilot,
 )
 from vtbdrake_diagrams.space_climber.studies.perceived import (
     BLOCKED_AHEAD,
@@ -50,28 +50,28 @@ INPUTS: Mapping[str, list[float]] = {
 }
 
 
-class Walker:
-    """Legs alone, and what they get at their ports."""
+class Rig:
+    """The pilot alone, and what it gets at its ports."""
 
     def __init__(self) -> None:
-        self.legs = Legs()
-        self.simulator = Simulator(self.legs)
+        self.pilot = Pilot()
+        self.simulator = Simulator(self.pilot)
         self.set(**INPUTS)
 
     def set(self, **values: list[float]) -> None:
         for name, value in values.items():
-            self.legs.GetInputPort(name).FixValue(self.simulator.get_mutable_context(), value)
+            self.pilot.GetInputPort(name).FixValue(self.simulator.get_mutable_context(), value)
 
     def until(self, time: float) -> None:
         """Go on to a time in s, the step at that instant included."""
         self.simulator.AdvanceTo(time + 0.5 * PERIOD)
 
     def output(self, name: str) -> np.ndarray:
-        return self.legs.GetOutputPort(name).Eval(self.simulator.get_context())
+        return self.pilot.GetOutputPort(name).Eval(self.simulator.get_context())
 
     @property
     def phase(self) -> Phase:
-        return Phase(int(self.legs.phase.view(self.simulator.get_context()).phase))
+        return Phase(int(self.pilot.phase.view(self.simulator.get_context()).phase))
 
     def go(self, heading: float) -> float:
         """Let it ask, and answer; return when it goes."""
@@ -86,54 +86,54 @@ class Walker:
         return begin
 
 
-def test_legs_walk_a_leg_and_tell_of_it() -> None:
-    walker = Walker()
-    begin = walker.go(0.3)
+def test_pilot_walks_a_leg_and_tells_of_it() -> None:
+    rig = Rig()
+    begin = rig.go(0.3)
     for k in range(1, round(LEG / SEGMENT) + 1):
-        walker.set(pose=[0.0, 0.0, 0.0, 0.9 * k, 0.0, 0.2], navigation=[0.8 * k, 0.1 * k, *[0.0] * 10])
-        walker.until(begin + k * SEGMENT)
-    assert walker.phase == Phase.LOOK and walker.output("walk") == 0.0
-    places, blocked, _, _, stepped, *path = walker.output("leg")
+        rig.set(pose=[0.0, 0.0, 0.0, 0.9 * k, 0.0, 0.2], navigation=[0.8 * k, 0.1 * k, *[0.0] * 10])
+        rig.until(begin + k * SEGMENT)
+    assert rig.phase == Phase.LOOK and rig.output("walk") == 0.0
+    places, blocked, _, _, stepped, *path = rig.output("leg")
     assert (places, blocked, stepped) == (5.0, 0.0, pytest.approx(3.6))
     np.testing.assert_allclose(np.reshape(path, (-1, 2)), [[0.8 * k, 0.1 * k] for k in range(5)])
-    walker.until(begin + LEG + LOOKING)
-    assert walker.output("request") == 2.0
+    rig.until(begin + LEG + LOOKING)
+    assert rig.output("request") == 2.0
 
 
-def test_blocked_legs_go_back_as_they_came() -> None:
-    walker = Walker()
+def test_blocked_pilot_goes_back_as_it_came() -> None:
+    rig = Rig()
     yaw = 0.5
-    walker.set(pose=[0.0, 0.0, yaw, 0.0, 0.0, 0.2], navigation=[2.0, 1.0, *[0.0] * 10])
-    begin = walker.go(0.3)
-    walker.until(begin + BLOCKED_WITHIN)
-    assert walker.phase == Phase.BACK and (walker.output("heading"), walker.output("walk")) == (yaw, -1.0)
-    _, blocked, x, y, *_ = walker.output("leg")
+    rig.set(pose=[0.0, 0.0, yaw, 0.0, 0.0, 0.2], navigation=[2.0, 1.0, *[0.0] * 10])
+    begin = rig.go(0.3)
+    rig.until(begin + BLOCKED_WITHIN)
+    assert rig.phase == Phase.BACK and (rig.output("heading"), rig.output("walk")) == (yaw, -1.0)
+    _, blocked, x, y, *_ = rig.output("leg")
     assert blocked == 1.0
     np.testing.assert_allclose([x, y], [2.0 + BLOCKED_AHEAD * np.cos(yaw), 1.0 + BLOCKED_AHEAD * np.sin(yaw)])
-    walker.until(begin + BLOCKED_WITHIN + GOING_BACK)
-    assert walker.phase == Phase.LOOK and walker.output("walk") == 0.0
+    rig.until(begin + BLOCKED_WITHIN + GOING_BACK)
+    assert rig.phase == Phase.LOOK and rig.output("walk") == 0.0
 
 
 @pytest.mark.parametrize("answer", ["late", "stand"])
-def test_legs_stand_and_ask_again(answer: str) -> None:
-    walker = Walker()
-    walker.until(LOOKING + LATENCY)
+def test_pilot_stands_and_asks_again(answer: str) -> None:
+    rig = Rig()
+    rig.until(LOOKING + LATENCY)
     if answer == "late":
-        walker.set(missed=[1.0])
+        rig.set(missed=[1.0])
     else:
-        walker.set(decision=[0.0, 1.0, 0.0], sampled_at=[LOOKING + PERIOD])
-    walker.until(2.0 * (LOOKING + LATENCY))
-    assert walker.output("walk") == 0.0 and walker.output("request") == 2.0
+        rig.set(decision=[0.0, 1.0, 0.0], sampled_at=[LOOKING + PERIOD])
+    rig.until(2.0 * (LOOKING + LATENCY))
+    assert rig.output("walk") == 0.0 and rig.output("request") == 2.0
 
 
-def test_legs_stand_when_they_are_told_to() -> None:
-    walker = Walker()
-    begin = walker.go(0.3)
-    walker.set(explore=[0.0])
-    walker.until(begin + PERIOD)
-    assert walker.output("walk") == 0.0
-    walker.until(begin + 3.0 * LOOKING)
-    assert walker.output("request") == 1.0
+def test_pilot_stands_when_it_is_told_to() -> None:
+    rig = Rig()
+    begin = rig.go(0.3)
+    rig.set(explore=[0.0])
+    rig.until(begin + PERIOD)
+    assert rig.output("walk") == 0.0
+    rig.until(begin + 3.0 * LOOKING)
+    assert rig.output("request") == 1.0
 
 
 def test_what_is_believed_is_remembered_exactly() -> None:
