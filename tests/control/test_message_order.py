@@ -46,6 +46,17 @@ def test_simulation_may_be_faster_than_real_time(period: float) -> None:
     assert told[-1] == "ahead of time"
 
 
+def test_sender_that_waits_for_this_computer_may_be_ahead_by_anything() -> None:
+    order = MachineOrder(WINDOW)
+    messages = [(0.01, 50.0), (0.02, 80.0), (0.03, 79.0), (0.04, 9000.0)]
+    assert take(order, *messages) == ["", "ahead of time", "ahead of time", "ahead of time"]
+    order = MachineOrder(WINDOW)
+    order.limit_lead(False)
+    assert take(order, *messages) == ["", "", "out of order", ""]
+    order.limit_lead(True)
+    assert take(order, (0.05, 9000.1), (0.06, 9002.0)) == ["", "ahead of time"]
+
+
 @pytest.mark.parametrize("jump", [-20.0, 20.0, 1e6])
 @pytest.mark.parametrize("period", [0.01, 1.0])
 def test_machine_is_believed_a_new_time_that_goes_on(jump: float, period: float) -> None:

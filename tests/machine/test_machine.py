@@ -297,6 +297,18 @@ def test_late_command_is_rejected(timeout: float) -> None:
     assert robot.status().rejected == {"torque": {"late": 1}}
 
 
+@pytest.mark.parametrize("in_lock_step", [True, False])
+def test_command_after_a_gap_in_lock_step_is_not_ahead_of_time(in_lock_step: bool) -> None:
+    """A loop and its machine that are faster than real time lose ten seconds of commands in no time."""
+    robot = machine(max_latency=np.inf)
+    if not in_lock_step:
+        robot.reject_late(True)
+    for sent in (1_000_000, 11_000_000):  # us
+        robot.receive(COMMAND, torque(1.0, sent))
+        run(robot, 1)
+    assert robot.status().rejected["torque"] == ({} if in_lock_step else {"ahead of time": 1})
+
+
 def test_brake_locks_joints_with_actuators() -> None:
     robot = machine(timeout=0.01)
     run(robot, 5, command=0.0)

@@ -77,8 +77,8 @@ class MachineOrder(MessageOrder):
     """
 
     def __init__(self, window: float, period: float = 0.0) -> None:
-        self._window = window
-        self._most = MAX_AHEAD + period
+        self._window, self._period = window, period
+        self.limit_lead(True)
         self._last = -inf  # time of the sender in the last accepted message
         self._ahead = inf  # by how much it was ahead of ours, at most: a message that has waited does not count
         # The same of the messages that do not continue this time, but each other, and when the first of them came.
@@ -88,6 +88,14 @@ class MachineOrder(MessageOrder):
 
     def expect_gap(self) -> None:
         self._ahead = inf
+
+    def limit_lead(self, is_limited: bool) -> None:
+        """Let no message be ``ahead of time``, or limit again by how much it may be ahead.
+
+        Args:
+            is_limited: Whether to limit it: not where the sender waits for this computer, in lock-step.
+        """
+        self._most = MAX_AHEAD + self._period if is_limited else inf
 
     def _problem(self, sent: float, now: float, sender: str) -> str:
         if self._last < sent <= now + self._ahead + self._most:

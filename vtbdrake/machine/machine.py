@@ -132,7 +132,7 @@ class Machine:
         self._counts = dict.fromkeys(signals, 0)
         self._accepted = dict.fromkeys(signals, -inf)  # The cycle of the last accepted command.
         self._commands: dict[str, Any] = dict.fromkeys(signals)
-        self._latencies: dict[str, LatencyMonitor] = {}
+        self.reject_late(False)
         self._patience = whole_cycles(config.timeout, period)
         self._silent: list[str] = []
         self._stopped = False
@@ -179,11 +179,16 @@ class Machine:
     def reject_late(self, reject: bool) -> None:
         """Reject, or accept, commands whose latency exceeds the quickest one's by more than ``max_latency``.
 
-        Such commands have waited somewhere, in a hub that was stopped for example. This needs a sender whose clock
-        runs as fast as this computer's, so not in lock-step. A sender that does not tell the time is never late.
+        Such commands have waited somewhere, in a hub that was stopped for example. Commands that are far ahead of this
+        computer's clock are rejected likewise, see `MachineOrder`. Both need a sender whose clock runs as fast as this
+        computer's, so not in lock-step. A sender that does not tell the time is never late.
         """
+        for reader in self._readers.values():
+            reader.limit_lead(reject)
         is_limited = reject and self.config.max_latency < inf
-        self._latencies = {n: LatencyMonitor(self.config.max_latency) for n in self._received} if is_limited else {}
+        self._latencies: dict[str, LatencyMonitor] = (
+            {n: LatencyMonitor(self.config.max_latency) for n in self._received} if is_limited else {}
+        )
 
     # -- cycles
 
