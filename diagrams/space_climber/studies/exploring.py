@@ -60,9 +60,6 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
 )
 from vtbdrake_diagrams.space_climber.survey import survey
 
-EXPLORE = "u.explore"
-"""The address of the command to find the way out: 1 to go, 0 to stand."""
-
 PERIOD = 0.2
 """Period of ``pilot`` and ``head`` in s."""
 
@@ -93,7 +90,7 @@ class Phase(IntEnum):
 
 
 class Pilot(AddressedSystem):
-    """A system that stands, asks where to go, and walks there for a while.
+    """A system that lets the robot stand, asks where to go, and lets it walk there for a while.
 
     .. pydrake_system::
 
@@ -120,14 +117,8 @@ class Pilot(AddressedSystem):
 
     def __init__(self) -> None:
         super().__init__()
-        for name, size in {
-            "pose": 6,
-            "navigation": 12,
-            "explore": 1,
-            "decision": 3,
-            "sampled_at": 1,
-            "missed": 1,
-        }.items():
+        sizes = {"pose": 6, "navigation": 12, "explore": 1, "decision": 3, "sampled_at": 1, "missed": 1}
+        for name, size in sizes.items():
             self.DeclareVectorInputPort(name, size)
         count, point = Quantity(0.0), Quantity([0.0, 0.0], "m")
         self.phase = self.declare_discrete_state(
