@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import ceil, floor
@@ -61,6 +61,32 @@ def read_results(path: Path) -> dict[str, Any]:
         raise KeptResultsError(f"the results in {path} do not have its digest: make it anew by {content['command']!r}")
     results: dict[str, Any] = content["results"]
     return results
+
+
+def add_results(
+    path: Path,
+    results: dict[int, _Result],
+    seeds: Iterable[int],
+    function: Callable[[int], _Result],
+    *,
+    command: str,
+    workers: int | None = None,
+) -> None:
+    """Make the results of the seeds that are not among some results, in processes, and keep all after each of them.
+
+    Args:
+        path: The file, see `write_results`.
+        results: The results by seed, which are added to.
+        seeds: The seeds.
+        function: A function of a module that makes the result of a seed.
+        command: The command that makes the file.
+        workers: The number of processes, see `in_processes`.
+    """
+    missing = [seed for seed in seeds if seed not in results]
+    for seed, result in in_processes(function, missing, workers=workers):
+        results[seed] = result
+        write_results(path, results, command=command)
+        print(f"{len(results)} results", flush=True)
 
 
 def _digest(results: Any) -> str:

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.kept_results import KeptResultsError, Repetition, read_results, repeat, write_results
+from vtbdrake_diagrams.kept_results import (
+    KeptResultsError,
+    Repetition,
+    add_results,
+    read_results,
+    repeat,
+    write_results,
+)
 from vtbdrake_diagrams.processes import in_processes
 
 RESULTS = {"times": np.array([1.5, np.nan]), "name": "a", "rows": [{"count": 2}]}
@@ -50,6 +57,13 @@ SQUARES = {number: float(number**2) for number in range(1, 31)}
 
 def square(number: int) -> float:
     return float(number) ** 2
+
+
+def test_only_results_that_are_missing_are_made_and_all_are_kept(tmp_path: Path) -> None:
+    file, results = tmp_path / "kept.json", {2: -4.0}
+    add_results(file, results, range(1, 5), square, command="make it", workers=1)
+    assert results == {1: 1.0, 2: -4.0, 3: 9.0, 4: 16.0}
+    assert read_results(file) == {str(seed): value for seed, value in results.items()}
 
 
 def near(before: float, now: float) -> bool:

@@ -60,6 +60,13 @@ class MessageOrder(ABC):
     def expect_gap(self) -> None:  # noqa: B027 - most need not
         """Take note that messages may be missing, because the bus was lost."""
 
+    def limit_lead(self, is_limited: bool) -> None:  # noqa: B027 - most do not
+        """Let no message be ``ahead of time``, or limit again by how much it may be ahead.
+
+        Args:
+            is_limited: Whether to limit it: not where the sender waits for this computer, in lock-step.
+        """
+
 
 class MachineOrder(MessageOrder):
     """The order of the messages of one sender, a machine, which counts on a clock.
@@ -90,11 +97,6 @@ class MachineOrder(MessageOrder):
         self._ahead = inf
 
     def limit_lead(self, is_limited: bool) -> None:
-        """Let no message be ``ahead of time``, or limit again by how much it may be ahead.
-
-        Args:
-            is_limited: Whether to limit it: not where the sender waits for this computer, in lock-step.
-        """
         self._most = MAX_AHEAD + self._period if is_limited else inf
 
     def _problem(self, sent: float, now: float, sender: str) -> str:

@@ -355,23 +355,22 @@ class ChannelReader:
         self._map = map
         self._names_sender = several_senders and map.sender is not None
         self._decode = map.decoder(signals)
-        self._order = CommandOrder(reorder_window) if several_senders else MachineOrder(reorder_window, period)
-        self._inbox = Inbox(signals, received, self._order)
+        order = CommandOrder(reorder_window) if several_senders else MachineOrder(reorder_window, period)
+        self._inbox = Inbox(signals, received, order)
         self._rejected = rejected
 
     @property
     def clock_jumps(self) -> int:
         """Return the number of accepted jumps of a sender's time, back or ahead."""
-        return self._order.clock_jumps
+        return self._inbox.order.clock_jumps
 
     def expect_gap(self) -> None:
         """Accept the next message however far ahead it is: after a loss of the bus, messages are missing."""
-        self._order.expect_gap()
+        self._inbox.order.expect_gap()
 
     def limit_lead(self, is_limited: bool) -> None:
-        """Limit by how much a message may be ahead of this computer's clock, or not; see `MachineOrder.limit_lead`."""
-        if isinstance(self._order, MachineOrder):
-            self._order.limit_lead(is_limited)
+        """Limit by how much a message may be ahead of this computer's clock, or not; see `MessageOrder.limit_lead`."""
+        self._inbox.order.limit_lead(is_limited)
 
     def receive(self, channel: str, data: bytes) -> None:
         """Handle one message.

@@ -33,8 +33,7 @@ from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive, rms
 from vtbdrake_diagrams.forest.world.stand import MAPS
-from vtbdrake_diagrams.kept_results import read_results, write_results
-from vtbdrake_diagrams.processes import in_processes
+from vtbdrake_diagrams.kept_results import add_results, read_results
 
 SEED = 710_000
 """The seed of the first forest."""
@@ -282,11 +281,8 @@ def load() -> dict[int, list[Error]]:
 def main(forests: int, workers: int) -> None:
     """Drive through the forests that the file lacks, and print the table of all."""
     results = load() if FILE.exists() else {}
-    seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
-    for seed, errors in in_processes(compared, seeds, workers=workers):
-        results[seed] = errors
-        write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.fusion")
-        print(f"{len(results)} forests", flush=True)
+    command = "python -m vtbdrake_diagrams.forest.studies.fusion"
+    add_results(FILE, results, range(SEED, SEED + forests), compared, command=command, workers=workers)
     print(report(results))
 
 

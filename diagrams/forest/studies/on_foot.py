@@ -36,14 +36,13 @@ from vtbdrake_diagrams.forest.studies.drives import (
     Drive,
     Track,
     forest,
-    in_processes,
     localize,
     nees_bounds,
     recorded_drive,
     rms,
 )
 from vtbdrake_diagrams.forest.world.stand import MAPS
-from vtbdrake_diagrams.kept_results import read_results, write_results
+from vtbdrake_diagrams.kept_results import add_results, read_results
 
 SEED = 730_000
 """The seed of the first forest. No constant of the walk or of the unit may be chosen with forests from this seed on."""
@@ -332,11 +331,8 @@ def load(file: Path = FILE) -> dict[int, list[Way]]:
 def main(forests: int, workers: int) -> None:
     """Go through the forests that the file lacks, and print the table of all."""
     results = load() if FILE.exists() else {}
-    seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
-    for seed, ways in in_processes(walked, seeds, workers=workers):
-        results[seed] = ways
-        write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.on_foot")
-        print(f"{len(results)} forests", flush=True)
+    command = "python -m vtbdrake_diagrams.forest.studies.on_foot"
+    add_results(FILE, results, range(SEED, SEED + forests), walked, command=command, workers=workers)
     print(report(results))
     print(f"on foot: {_word(holds(results))}")
 

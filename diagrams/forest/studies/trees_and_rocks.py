@@ -31,12 +31,11 @@ from vtbdrake_diagrams.forest.studies.drives import (
     ABUNDANCES,
     Drive,
     forest,
-    in_processes,
     localize,
     recorded_drive,
 )
 from vtbdrake_diagrams.forest.studies.on_foot import MAP_NAMES, Way, Ways, judged, load, report, summary
-from vtbdrake_diagrams.kept_results import write_results
+from vtbdrake_diagrams.kept_results import add_results
 from vtbdrake_diagrams.plain.scenario import scanner_config
 
 SEED = 740_000
@@ -120,11 +119,8 @@ def in_words(ways: Ways) -> str:
 def main(forests: int, workers: int) -> None:
     """Drive through the forests that the file lacks, and print the table of all."""
     results = load(FILE) if FILE.exists() else {}
-    seeds = [seed for seed in range(SEED, SEED + forests) if seed not in results]
-    for seed, ways in in_processes(driven, seeds, workers=workers):
-        results[seed] = ways
-        write_results(FILE, results, command="python -m vtbdrake_diagrams.forest.studies.trees_and_rocks")
-        print(f"{len(results)} forests", flush=True)
+    command = "python -m vtbdrake_diagrams.forest.studies.trees_and_rocks"
+    add_results(FILE, results, range(SEED, SEED + forests), driven, command=command, workers=workers)
     print(report(results, tuple(LANDMARKS)))
     print(in_words(results))
 

@@ -42,7 +42,7 @@ from vtbdrake_diagrams.forest.world.carrier import INSTANCE, quaternion_matrix
 from vtbdrake_diagrams.forest.world.ground import Ground
 
 PLACES = {"hand": 0.45, "back": -0.25}
-"""Where a worker carries the unit, and how far it is in front of the middle of the body there, in m."""
+"""The places at which a worker carries the unit, each with its distance in front of the middle of the body in m."""
 
 WALKER = 7
 """The size of the port ``walker`` of `Legs`: quaternion and position."""

@@ -64,7 +64,7 @@ PERIOD = 0.2
 """Period of ``pilot`` and ``head`` in s."""
 
 STEP = 0.1
-"""How far a first command may be from the measured joints, in rad."""
+"""The largest distance of a first command from the measured joints, in rad."""
 
 LATENCY = 3.0
 """Time from a request to its decision, in s."""
@@ -81,7 +81,7 @@ _ROUNDING = 1e-6
 
 
 class Phase(IntEnum):
-    """What the pilot lets the robot do."""
+    """The states of a `Pilot`."""
 
     LOOK = 0
     ASK = 1
@@ -370,7 +370,7 @@ class ExploringScenario(CraterScenario):
 
 @dataclass(frozen=True)
 class Exploration:
-    """How the robot ended in a crater.
+    """The outcome of one exploration of a crater.
 
     Attributes:
         seed: The crater's seed.

@@ -91,8 +91,9 @@ LEAST_GAIN = 0.2
 """A rollout that brings the robot less far down the cost to the rim, in m, brings it nowhere."""
 
 LONGEST = 600.0
-"""How long a robot may take, its stops included, in s. Without a detour it takes a little more than 300 s, so there is
-time for one. With 450 s, as it was for craters below 1300, walks were cut that still gained; see docs/crater.md."""
+"""The longest time that a robot may take, its stops included, in s. Without a detour it takes a little more than 300 s,
+so there is time for one. With 450 s, as it was for craters below 1300, walks were cut that still gained; see
+docs/crater.md."""
 
 RADIUS = SPEED * TRIED + 3.0
 """How far a mental world reaches, in m."""

@@ -20,8 +20,10 @@ FREQUENCY = 2.0
 """The number of steps per second of the walk."""
 BOB = 0.02
 """The amplitude of the height of the walk, in m."""
-BEGIN, END = 2.0, 12.0
-"""The times in s between which the walker walks."""
+BEGIN = 2.0
+"""The time at which the walker begins to walk, in s."""
+END = 12.0
+"""The time at which the walker stands again, in s."""
 
 
 class Walk(LeafSystem):

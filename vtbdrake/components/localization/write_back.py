@@ -1,4 +1,4 @@
-"""What a drive has shown, written back into the semantic world model that its map came from.
+"""Writes what a drive has shown back into the semantic world model that its map came from.
 
 The model then has the landmarks that the survey lacked, with the covariances of the filter, and not the ones that are
 gone. So a mental world that is built from it (`add_to_plant`) has them, too.
