@@ -16,6 +16,7 @@ import numpy as np
 import vtbdrake as vtb
 from vtbdrake.calibration import RolloutCalibration, Window, calibrate_by_rollouts
 from vtbdrake.common.arrays import Array
+from vtbdrake.recording import Log, Series
 from vtbdrake.rollout import RolloutTask, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import Scenario
@@ -33,6 +34,8 @@ JOINTS = (
     "ankle_spring_joint_left", "toe_left", "ankle_spring_joint_right", "toe_right",
 )  # fmt: skip
 _ENCODERS = [k for k, joint in enumerate(JOINTS) if not joint.startswith("ankle_spring")]
+ENCODED = tuple(JOINTS[k] for k in _ENCODERS)
+"""The joints with encoders, in the order of the recordings."""
 # Number of positions, pelvis included.
 _NQ = 23
 # Number of positions of the pelvis: a quaternion and a point.
@@ -47,11 +50,40 @@ def landings(folder: Path, scenario: Scenario) -> list[Window]:
     Raises:
         FileNotFoundError: The folder has none.
     """
+    rows = _plant_rows(scenario)
+    return [_landing(folder / "data", number, rows) for number in _numbers(folder)]
+
+
+def logs(folder: Path, *, position: str, torque: str) -> list[Log]:
+    """Return the landings as logs at their own times, with the joints that have encoders and the motors.
+
+    Args:
+        folder: The folder of the recordings.
+        position: The name that the positions get, in the order of `ENCODED`.
+        torque: The name that the torques get, in the order of `MOTORS`.
+
+    Raises:
+        FileNotFoundError: The folder has none.
+    """
+    recordings = []
+    for number in _numbers(folder):
+        times, recorded, torques = _arrays(folder / "data", number)
+        joints = Series(times, recorded[:, [_BASE_Q + k for k in _ENCODERS]])
+        recordings.append(Log(f"landing {number}", {position: joints}, {torque: Series(times, torques)}))
+    return recordings
+
+
+def _numbers(folder: Path) -> list[str]:
     numbers = sorted(path.stem[2:] for path in folder.glob("data/t_*.npy"))
     if not numbers:
         raise FileNotFoundError(f"{folder} has no landings, data/t_00.npy, ...")
-    rows = _plant_rows(scenario)
-    return [_landing(folder / "data", number, rows) for number in numbers]
+    return numbers
+
+
+def _arrays(folder: Path, number: str) -> tuple[Array, Array, Array]:
+    """Return times (n,), states (n, 45) and torques (n, 10) of a landing, as recorded."""
+    times, recorded, torques = (np.load(folder / f"{letter}_{number}.npy") for letter in "txu")
+    return times, recorded, torques
 
 
 def _plant_rows(scenario: Scenario) -> Array:
@@ -65,7 +97,7 @@ def _plant_rows(scenario: Scenario) -> Array:
 
 
 def _landing(folder: Path, number: str, rows: Array) -> Window:
-    times, recorded, torques = (np.load(folder / f"{letter}_{number}.npy") for letter in "txu")
+    times, recorded, torques = _arrays(folder, number)
     grid = PERIOD * np.arange(SAMPLES)
     # The times of the recording are the messages' times.
     samples = np.column_stack([np.interp(grid, times, column) for column in recorded.T])

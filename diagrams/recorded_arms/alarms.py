@@ -1,7 +1,10 @@
 """The checks of a calibration, on recorded pendulums, arms and legs whose columns are as they should be.
 
 ``python -m vtbdrake_diagrams.recorded_arms.alarms FOLDER`` prints it. FOLDER holds the folders of the recordings, as
-for `vtbdrake_diagrams.recorded_arms.reality`, and dfki_double_pendulum. Nothing is fitted but inverse dynamics.
+for `vtbdrake_diagrams.recorded_arms.reality`, dfki_double_pendulum and cassie_impact. Nothing is fitted but inverse
+dynamics. Cassie's legs are closed by rods and springs, so that their torques have no inverse dynamics here: of these
+landings, clock and columns are checked, as of the others, and with ``--cassie MODEL`` the refusal of its model is
+printed.
 """
 
 from __future__ import annotations
@@ -23,6 +26,9 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.settings import setting
 from vtbdrake.recording import Log, Series
 from vtbdrake.recording.log import GAP
+from vtbdrake.testbed import Interface, Signal
+from vtbdrake_diagrams.cassie_landing import CassieLandingScenario
+from vtbdrake_diagrams.cassie_landing import reality as cassie
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.double_pendulum import reality as double
 from vtbdrake_diagrams.recorded_arms import pendulum, plants, subjects
@@ -127,6 +133,21 @@ def recorded(folder: Path) -> Iterator[Recorded]:
         yield of_arm("Go2 left" if leg.source.endswith("L") else "Go2 right", leg)
 
 
+def column_alarms(log: Log) -> list[str]:
+    """Return what the checks of clock and columns say of a landing of Cassie, as sentences.
+
+    Args:
+        log: The landing, with the positions of the joints with encoders and the torques of the motors.
+    """
+    torques = CassieLandingScenario().interface().act
+    interface = Interface(sense=[Signal(POSITION, size=len(cassie.ENCODED), unit="rad")], act=torques)
+    try:
+        checks = check_log(log, interface, position=POSITION, torque=torques[0].name)
+    except CalibrationError as error:
+        return [f"refused: {error}"]
+    return [*(f"remark: {each}" for each in checks.remarks), *(f"doubt: {each}" for each in checks.doubts)]
+
+
 def of_double_pendulum(folder: Path) -> list[Recorded]:
     """Return the excitation runs of the double pendulum, and its swing-ups."""
     ranges = tuple(vtb.Parameter(address, *ends) for address, ends in double.RANGES.items())
@@ -160,15 +181,25 @@ def of_arm(arm: str, recording: JointRecording) -> Recorded:
 
 @click.command()
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-def main(folder: Path) -> None:
+@click.option("--cassie", "model", type=click.Path(exists=True, dir_okay=False), help="cassie_v2.urdf.")
+def main(folder: Path, model: str | None) -> None:
     """Check the recordings in FOLDER."""
     rows, sentences = [], []
     for each in recorded(folder):
         share, alarms = each.alarms()
         rows.append([each.name, f"{each.log.end - each.log.start:.3g} s", f"{share:.2g}", str(len(alarms))])
         sentences += [f"{each.name}: {alarm}" for alarm in alarms]
+    for log in cassie.logs(folder / "cassie_impact", position=POSITION, torque=TORQUE):
+        alarms = column_alarms(log)
+        rows.append([f"Cassie {log.source}", f"{log.end - log.start:.3g} s", "columns only", str(len(alarms))])
+        sentences += [f"Cassie {log.source}: {alarm}" for alarm in alarms]
     click.echo(table(["recording", "duration", "unexplained", "alarms"], rows))
     click.echo("\n".join(sentences))
+    if model is not None:
+        try:
+            JointModel(CassieLandingScenario(model=model).build(), measured_torque=True)
+        except CalibrationError as error:
+            click.echo(f"Cassie's model: {error}")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,8 +12,16 @@ import pytest
 from tests.real import recordings
 from vtbdrake.calibration.log_checks import check_log
 from vtbdrake.recording import Log, Series
+from vtbdrake_diagrams.cassie_landing.reality import logs
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
-from vtbdrake_diagrams.recorded_arms.alarms import POSITION, TORQUE, Recorded, of_arm, of_double_pendulum
+from vtbdrake_diagrams.recorded_arms.alarms import (
+    POSITION,
+    TORQUE,
+    Recorded,
+    column_alarms,
+    of_arm,
+    of_double_pendulum,
+)
 from vtbdrake_diagrams.recorded_arms.subjects import go2_recordings, tx40_recording
 
 pytestmark = pytest.mark.one_python
@@ -49,6 +58,29 @@ def test_real_leg_raises_no_alarm() -> None:
     leg = go2_recordings(recordings("go2_leg")[0])[0]
     share, alarms = of_arm("Go2 left", leg).alarms()
     assert share < 0.1 and not alarms
+
+
+def test_real_landings_raise_no_alarm() -> None:
+    landings = logs(recordings("cassie_impact")[0], position=POSITION, torque=TORQUE)
+    assert len(landings) == 29 and not any(column_alarms(log) for log in landings)
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "alarm"),
+    [
+        ("q", lambda values: values + 2.0 * np.pi * (np.arange(len(values)) >= 50)[:, None] * np.eye(14)[3], "wrapped"),
+        ("q", lambda values: np.where(np.arange(14) == 6, values[:1], values), r"never changes in the entries 6"),
+        ("u", lambda values: 1e3 * values, "beyond its bounds"),
+    ],
+)
+def test_defect_of_a_real_landing_is_noticed(
+    column: str, change: Callable[[np.ndarray], np.ndarray], alarm: str
+) -> None:
+    for log in logs(recordings("cassie_impact")[0], position=POSITION, torque=TORQUE):
+        q, u = log.sense[POSITION], log.act[TORQUE]
+        q, u = (replace(each, values=change(each.values)) if column == k else each for k, each in (("q", q), ("u", u)))
+        said = " ".join(column_alarms(Log(log.source, {POSITION: q}, {TORQUE: u})))
+        assert re.search(alarm, said), said
 
 
 def late(q: np.ndarray, u: np.ndarray) -> Columns:
