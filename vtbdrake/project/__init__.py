@@ -3,15 +3,9 @@
 from pathlib import Path
 
 from vtbdrake.project.model_scenario import ModelFileScenario
-from vtbdrake.project.robot_file import (
-    ProjectRobot,
-    RobotFileError,
-    add_model,
-    hold_joint,
-    read_robot,
-    replace_servo,
-    resolve,
-)
+from vtbdrake.project.parser import add_model
+from vtbdrake.project.robot import ProjectRobot, RobotFileError, hold_joint, replace_servo
+from vtbdrake.project.robot_file import read_robot, resolve
 from vtbdrake.project.station_file import StationFile, StationFileError, read_station
 from vtbdrake.project.writer import ProjectError, check_name, write_project
 

@@ -20,7 +20,9 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from vtbdrake.common.failures import one_line
 from vtbdrake.project.model_copy import copy_model
-from vtbdrake.project.robot_file import PRISMATIC, SUFFIXES, RobotFileError, add_model, resolve
+from vtbdrake.project.parser import add_model
+from vtbdrake.project.robot import PRISMATIC, RobotFileError
+from vtbdrake.project.robot_file import SUFFIXES, resolve
 from vtbdrake.station import Station
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 

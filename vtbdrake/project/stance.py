@@ -34,7 +34,7 @@ from scipy.spatial import ConvexHull, QhullError
 from vtbdrake.components.standing import Gains, Stance, WholeBodyModel
 
 if TYPE_CHECKING:
-    from vtbdrake.project.robot_file import RobotJoint
+    from vtbdrake.project.robot import RobotJoint
 
 Array = NDArray[np.float64]
 

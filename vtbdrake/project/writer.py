@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from vtbdrake.project.robot_file import PRISMATIC, ProjectRobot, RobotJoint
+from vtbdrake.project.robot import PRISMATIC, ProjectRobot, RobotJoint
 from vtbdrake.project.rotors import FlyingRobot
 from vtbdrake.project.station_file import StationFile
 
