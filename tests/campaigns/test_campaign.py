@@ -25,7 +25,7 @@ from vtbdrake.campaigns.campaign import Campaign, CampaignError, Criterion
 from vtbdrake.campaigns.report import limits_text, range_text, reason
 from vtbdrake.campaigns.results import CampaignRollout, Cell, PairedComparison, interval, largest_rate, least_rate
 from vtbdrake.cli.campaign import campaign as command
-from vtbdrake.optimization.study.study_file import StudyError
+from vtbdrake.optimization.study.study_error import StudyError
 
 pytestmark = pytest.mark.one_python
 

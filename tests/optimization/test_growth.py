@@ -9,7 +9,8 @@ from tests.growth import calls
 from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study, Sweep
 from vtbdrake.optimization.pareto import undominated
-from vtbdrake.optimization.study.study_file import Mark, StudyError, StudyFile
+from vtbdrake.optimization.study.study_error import StudyError
+from vtbdrake.optimization.study.study_file import Mark, StudyFile
 
 
 def dominated(values):

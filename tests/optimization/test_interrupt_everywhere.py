@@ -8,7 +8,7 @@ from tests.interruptions import hanging_fails, interrupt, places
 from tests.optimization.studies import DAMPING, RATE, THETA, pendulum_problem
 from vtbdrake.common import interrupt as interrupts
 from vtbdrake.optimization import Parameter, Study, boundary, evaluator, sweep
-from vtbdrake.optimization.study import study, study_file, study_run
+from vtbdrake.optimization.study import claim, database, study, study_file, study_run
 from vtbdrake.rollout import Quality, ThreadExecutor, executor, runner, testbeds
 
 # Each place costs a study: so only some of the lines are interrupted, at equal distances.
@@ -37,9 +37,9 @@ def test_ctrl_c_anywhere_in_a_change_leaves_the_file_whole_and_unlocked(tmp_path
         made.set_attribute("seen", len(made.queue))
 
     held = []  # As a notebook holds the last exception, and with it all frames.
-    for place in places(change, study_file, contextlib, interrupts)[::4]:
+    for place in places(change, study_file, database, contextlib, interrupts)[::4]:
         before = len(made.queue), made.attributes.get("seen")
-        held.append(interrupt(change, study_file, contextlib, interrupts, at=place))
+        held.append(interrupt(change, study_file, database, contextlib, interrupts, at=place))
         assert len(made.queue) - before[0] in (0, 1), place
         assert made.attributes["seen"] in (before[1], len(made.queue)), place
         # Another connection, as one of another process.
@@ -61,7 +61,7 @@ def test_ctrl_c_anywhere_at_the_ends_of_a_run_leaves_the_study_usable(tmp_path):
 
     run()
     held = []
-    modules = study_file, contextlib, interrupts
+    modules = study_file, database, claim, contextlib, interrupts
     for place in places(run, *modules, lines=True)[::3]:
         held.append(interrupt(run, *modules, at=place))
         assert not made.is_running, place

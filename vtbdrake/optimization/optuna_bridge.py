@@ -16,7 +16,8 @@ from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study.study_file import StudyError, encode
+from vtbdrake.optimization.study.study_error import StudyError
+from vtbdrake.optimization.study.study_file import encode
 
 if TYPE_CHECKING:
     import optuna

@@ -17,7 +17,7 @@ from tests.folders import open_folder, that_cannot_be_written
 from tests.optimization.studies import DAMPING, pendulum_problem
 from vtbdrake.optimization import Study, StudyError
 from vtbdrake.optimization.records import Outcome
-from vtbdrake.optimization.study import study_file
+from vtbdrake.optimization.study import database
 from vtbdrake.optimization.study.study_file import Mark, StudyFile
 
 # Files and SQL.
@@ -69,7 +69,7 @@ def test_a_folder_is_no_study(tmp_path):
 
 
 def test_what_to_do_fits_what_is_wrong(tmp_path, monkeypatch):
-    monkeypatch.setattr(study_file, "PATIENCE", 0.0)
+    monkeypatch.setattr(database, "PATIENCE", 0.0)
     study = pendulum_problem().study(tmp_path / "a.db")
     file = StudyFile(study.path)
     with contextlib.closing(file), contextlib.closing(sqlite3.connect(study.path, isolation_level=None)) as other:

@@ -44,7 +44,8 @@ from vtbdrake.optimization.study.interventions import (
     StudySearch,
     check_arguments,
 )
-from vtbdrake.optimization.study.study_file import StudyError, StudyFile
+from vtbdrake.optimization.study.study_error import StudyError
+from vtbdrake.optimization.study.study_file import StudyFile
 from vtbdrake.optimization.study.study_run import BUDGET, INTERRUPTED, SOLVER, TARGET, StudyRun, check_budget
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Executor, RolloutResult

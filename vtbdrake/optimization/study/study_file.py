@@ -1,43 +1,31 @@
-"""A study on disk: one SQLite file with a write-ahead log, to which every finished rollout is written at once.
-
-Every row has a checksum. A file that was changed by anything but a study is damaged, and nothing is read from it.
-"""
+"""A study on disk: what its file holds, to which every finished rollout is written at once."""
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
 import sqlite3
-import threading
-import time
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from itertools import chain
 from math import isnan, nan
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from vtbdrake.common.failures import one_line
-from vtbdrake.common.interrupt import interrupts_postponed
 from vtbdrake.optimization.records import DrivenTrial, Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study.claim import claimed, is_claimed
+from vtbdrake.optimization.study.database import Database, Schema
 from vtbdrake.optimization.study.interventions import TRY
-from vtbdrake.optimization.study.write_ahead_log import lost_writes
+from vtbdrake.optimization.study.study_error import StudyError
 from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import QUALITY_FAILED
 
 _log = logging.getLogger(__name__)
-_Result = TypeVar("_Result")
 
-VERSION = 3
-_APPLICATION = 0x56544253  # "VTBS"
-
-# Each table also has a last column, ``checksum``.
 _TABLES = {
     "meta": "key TEXT PRIMARY KEY, value TEXT",
     # A rollout is stored once, even if several points ask for it.
@@ -56,17 +44,16 @@ _TABLES = {
     "attributes": "point TEXT, key TEXT, value TEXT",
 }
 _KEYS = {"rollouts": "point, condition", "trials": "batch, position", "attributes": "point, key"}
-# s that a change waits for a process that is writing; and how long SQLite waits at a time, in which no Ctrl-C comes.
-PATIENCE = 30.0
-_TURN = 0.2
-# The pages of the write-ahead log before they are written to the file, where every row is checked.
-_LOG_PAGES = 200
+_SCHEMA = Schema(
+    application=0x56544253,  # "VTBS"
+    version=3,
+    tables=_TABLES,
+    keys=_KEYS,
+    # The process that runs the study asks before every batch what waits.
+    indices=["CREATE INDEX batches ON interventions (batch)"],
+)
 _PROGRESS = {"told", "first_position", "rollouts_before", "read_after_kill", "changes_of_rows", "changes_of_search"}
 _ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units", "limits"}
-
-
-class StudyError(ValueError):
-    """A file is no study, is damaged, belongs to another version or problem, or cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +99,6 @@ class StudyFile:
         if not isinstance(path, str | os.PathLike | None):
             raise StudyError(f"a study is a file, given by its path (or None, in memory), not by {path!r}")
         self.path = None if path is None else Path(path)
-        self._lock = threading.RLock()
         new = meta is not None
         if self.path is not None and self.path.is_dir():
             raise StudyError(f"{self.path} is a folder: a study is a file, such as {self.path / 'study.db'}")
@@ -121,104 +107,34 @@ class StudyFile:
                 raise StudyError(f"there is no study file {self.path}")
             if not self.path.parent.is_dir():
                 raise StudyError(f"{self.path} lies in a folder that does not exist")
-        has_log = False  # SQLite makes one as soon as it reads.
-        if self.path is not None:
-            _refuse_lost_writes(self.path)
-            log = _log_of(self.path)
-            has_log = log.exists() and log.stat().st_size > 0
-        with _explained(self.path):
-            # Commits are explicit; the lock of this object keeps threads apart.
-            self._db = sqlite3.connect(
-                _sqlite_name(self.path, new=new),
-                uri=True,
-                timeout=_TURN,
-                isolation_level=None,
-                check_same_thread=False,
-            )
+        self._db = Database(self.path, _SCHEMA, new=new)
         try:
-            with _explained(self.path):
-                self._refuse_others(new=new)
-                if not self._is_empty():
-                    self._refuse_damage()
-                # A killed process loses nothing that was committed; a power failure may lose the last rollouts.
-                self._db.execute("PRAGMA synchronous = NORMAL")
-                self._db.execute(f"PRAGMA wal_autocheckpoint = {_LOG_PAGES}")
-                if meta is not None and self._is_empty():
-                    self._create(meta)
-            self._addresses = [parameter["address"] for parameter in self.meta["problem"]["parameters"]]
+            if meta is not None:
+                self._db.create(lambda: self._set(meta))
+            about = self.meta
+            if missing := sorted(_ABOUT - about.keys()):
+                raise self._db.damaged(f"it lacks the entries {', '.join(missing)}")
+            self._addresses = [parameter["address"] for parameter in about["problem"]["parameters"]]
         except BaseException:
             self._db.close()
             raise
-        self._db.row_factory = sqlite3.Row
         # A batch, and the number of trials in the batches before it; counted on while this process runs the study.
         self._counted: tuple[int, int] | None = None
-        if self.path is not None and not new and not _is_claimed(self.path):
-            self._look_for_log(has_log=has_log)
+        if self.path is not None and not new and not is_claimed(self.path):
+            self._look_for_log()
 
-    def _is_empty(self) -> bool:
-        (tables,) = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        return bool(tables == 0)
-
-    def _refuse_others(self, *, new: bool) -> None:
-        """Refuse a file of another kind or version. It only reads, so that a file of others stays unchanged."""
-        (application,) = self._db.execute("PRAGMA application_id").fetchone()
-        (version,) = self._db.execute("PRAGMA user_version").fetchone()
-        if application == 0 and self._is_empty():
-            if not new:
-                raise StudyError(f"{self.path} is not a study: it is empty")
-            return
-        if application != _APPLICATION:
-            raise StudyError(f"{self.path} is not a study: it is an SQLite file of another kind")
-        if version != VERSION:
-            raise StudyError(
-                f"{self.path} is a study of version {version}, but this vtbdrake reads version {VERSION}: open it with "
-                "the vtbdrake that wrote it"
-            )
-
-    def _refuse_damage(self) -> None:
-        (verdict,) = self._db.execute("PRAGMA integrity_check(1)").fetchone()
-        if verdict != "ok":
-            raise _damaged(self.path, verdict)
-        for table in _TABLES:
-            made = self._db.execute("SELECT sql FROM sqlite_master WHERE name = ?", (table,)).fetchone()
-            if made is None or made[0] != _creation(table):
-                raise _damaged(self.path, f"the table {table} has other columns")
-            self._rows(table)
-        missing = sorted(_ABOUT - self.meta.keys())
-        if missing:
-            raise _damaged(self.path, f"it lacks the entries {', '.join(missing)}")
-
-    def _create(self, meta: Mapping[str, Any]) -> None:
-        self._db.execute("PRAGMA journal_mode = WAL")
-        with self._transaction():
-            if not self._is_empty():
-                return  # Another process has created it meanwhile.
-            for table in _TABLES:
-                self._db.execute(_creation(table))
-            # The process that runs the study asks before every batch what waits.
-            self._db.execute("CREATE INDEX batches ON interventions (batch)")
-            self._set(meta)
-            self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
-            self._db.execute(f"PRAGMA user_version = {VERSION}")
-        self._empty_log()
-
-    def _empty_log(self, how: str = "TRUNCATE") -> None:
-        """Write the log into the file; nothing happens while another process uses the log."""
-        with self._lock, _explained(self.path):
-            self._db.execute(f"PRAGMA wal_checkpoint({how})")
-
-    def _look_for_log(self, *, has_log: bool) -> None:
+    def _look_for_log(self) -> None:
         """Warn if the last run did not end, and the log in which it wrote is gone.
 
         That such a log was read is noted, because SQLite then writes it into the file and removes it.
         """
-        killed = self._number(
+        killed = self._db.number(
             "SELECT coalesce(max(number), 0) FROM sessions WHERE ended IS NULL AND number = "
             "(SELECT max(number) FROM sessions)"
         )
         if not killed or self._get("read_after_kill", 0) == killed:
             return
-        if has_log:
+        if self._db.had_log:
             with suppress(StudyError):  # The file cannot be written: then its log stays, too.
                 self._note_read(killed)
             return
@@ -230,59 +146,12 @@ class StudyFile:
         )
 
     def _note_read(self, session: int) -> None:
-        with self._transaction():
+        with self._db.transaction():
             self._set({"read_after_kill": session})
-
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        # Ctrl-C waits for its end, wherever it comes: an open transaction would lock out other processes and this one.
-        with interrupts_postponed() as arrived, self._lock, _explained(self.path):
-            try:
-                self._patiently(lambda: self._db.execute("BEGIN IMMEDIATE"), unless=arrived)
-                yield
-            except BaseException:
-                if self._db.in_transaction:  # On a full disk SQLite has already ended it.
-                    self._db.execute("ROLLBACK")
-                raise
-            self._db.execute("COMMIT")
-
-    def _patiently(self, use: Callable[[], _Result], *, unless: Sequence[int] = ()) -> _Result:
-        """Use the file; while another process holds it, try again, until a signal has come."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            try:
-                return use()
-            except sqlite3.OperationalError as error:
-                if _code(error) != sqlite3.SQLITE_BUSY or unless or time.monotonic() > deadline:
-                    raise
-
-    def _insert(self, table: str, rows: Iterable[tuple[Any, ...]], *, instead: str = "ABORT") -> None:
-        """Add rows with their checksums; ``instead`` is what SQLite does if there is a row of the same key."""
-        sealed = [(*row, _checksum(table, row)) for row in rows]
-        if sealed:
-            marks = ", ".join("?" * len(sealed[0]))
-            insert = f"INSERT OR {instead} INTO {table} VALUES ({marks})"
-            self._patiently(lambda: self._db.executemany(insert, sealed))
-
-    def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> list[sqlite3.Row]:
-        """Return checked rows of a table; ``more`` says which, and in which order."""
-        with self._lock, _explained(self.path):
-            rows = self._patiently(lambda: self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall())
-        for *row, checksum in rows:
-            if checksum != _checksum(table, row):
-                raise _damaged(self.path, f"a row of {table} has changed")
-        return rows
-
-    def _number(self, query: str, values: Sequence[Any] = ()) -> int:
-        """Return the single number that a query finds."""
-        with self._lock, _explained(self.path):
-            (number,) = self._patiently(lambda: self._db.execute(query, values).fetchone())
-        return int(number)
 
     def close(self) -> None:
         """Close the file."""
-        with self._lock:
-            self._db.close()
+        self._db.close()
 
     def while_claimed(self, run: Callable[[], str], *, versions: Mapping[str, str], revision: str) -> None:
         """Run the study in this process, which claims its file.
@@ -295,7 +164,7 @@ class StudyFile:
         Raises:
             StudyError: Another process has claimed it.
         """
-        _claimed(self.path, lambda: self._session(run, (json.dumps(dict(versions)), revision)))
+        claimed(self.path, lambda: self._session(run, (json.dumps(dict(versions)), revision)))
 
     def _session(self, run: Callable[[], str], about: tuple[str, str]) -> None:
         begun = (0, "")
@@ -303,7 +172,7 @@ class StudyFile:
         try:
             begun = self._begin_session(about)
             # From now on the file itself tells that its newest rows are in the log.
-            self._empty_log("PASSIVE")
+            self._db.empty_log("PASSIVE")
             self._counted = (0, 0)
             reason = run()
         except BaseException as error:
@@ -313,24 +182,24 @@ class StudyFile:
             self._counted = None
             if any(begun):
                 self._end_session((*begun, _now(), reason, *about))
-                self._empty_log()
+                self._db.empty_log()
 
     def _begin_session(self, about: tuple[str, str]) -> tuple[int, str]:
-        with self._transaction():
-            begun = (self._number("SELECT coalesce(max(number), 0) + 1 FROM sessions"), _now())
-            self._insert("sessions", [(*begun, None, None, *about)])
+        with self._db.transaction():
+            begun = (self._db.number("SELECT coalesce(max(number), 0) + 1 FROM sessions"), _now())
+            self._db.insert("sessions", [(*begun, None, None, *about)])
         return begun
 
     def _end_session(self, session: tuple[Any, ...]) -> None:
-        with self._transaction():
-            self._insert("sessions", [session], instead="REPLACE")
+        with self._db.transaction():
+            self._db.insert("sessions", [session], instead="REPLACE")
 
     # -- contents
 
     @property
     def meta(self) -> dict[str, Any]:
         """Return the description of the study by name: the problem, the solver, the seed and so on."""
-        return {key: json.loads(value) for key, value, _ in self._rows("meta")}
+        return {key: json.loads(value) for key, value, _ in self._db.rows("meta")}
 
     @property
     def description(self) -> dict[str, Any]:
@@ -338,10 +207,10 @@ class StudyFile:
         return {key: value for key, value in self.meta.items() if key not in _PROGRESS}
 
     def _set(self, values: Mapping[str, Any]) -> None:
-        self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
+        self._db.insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
 
     def _get(self, key: str, default: int) -> int:
-        rows = self._rows("meta", "WHERE key = ?", (key,))
+        rows = self._db.rows("meta", "WHERE key = ?", (key,))
         return int(json.loads(rows[0]["value"])) if rows else default
 
     @property
@@ -354,12 +223,12 @@ class StudyFile:
 
     def sessions(self) -> list[dict[str, Any]]:
         """Return every run: started, ended and reason (None if it was killed), versions and git revision."""
-        rows = [dict(row) for row in self._rows("sessions", "ORDER BY number")]
+        rows = [dict(row) for row in self._db.rows("sessions", "ORDER BY number")]
         return [{**row, "versions": json.loads(row["versions"])} for row in rows]
 
     def last_session(self) -> dict[str, Any] | None:
         """Return the last of `sessions`; None if the study has not run."""
-        rows = self._rows("sessions", "ORDER BY number DESC LIMIT 1")
+        rows = self._db.rows("sessions", "ORDER BY number DESC LIMIT 1")
         return {**rows[0], "versions": json.loads(rows[0]["versions"])} if rows else None
 
     def add(self, point: Point, condition: int, outcome: Outcome) -> None:
@@ -382,27 +251,25 @@ class StudyFile:
             _real(outcome.wall_time),
             _now(),
         )
-        # One statement is a transaction by itself.
-        with self._lock, _explained(self.path):
-            self._insert("rollouts", [row], instead="IGNORE")
+        self._db.insert("rollouts", [row], instead="IGNORE")  # One statement is a transaction by itself.
 
     def outcomes(self) -> dict[RolloutKey, Outcome]:
         """Return all finished rollouts by (point, number of the condition)."""
-        return dict(_outcomes(self._rows("rollouts", "ORDER BY rowid")))
+        return dict(_outcomes(self._db.rows("rollouts", "ORDER BY rowid")))
 
     def outcomes_of(self, points: Sequence[Point]) -> dict[RolloutKey, Outcome]:
         """Return the finished rollouts of points."""
-        rows = [self._rows("rollouts", "WHERE point = ? ORDER BY condition", (encode(point),)) for point in points]
+        rows = [self._db.rows("rollouts", "WHERE point = ? ORDER BY condition", (encode(point),)) for point in points]
         return dict(_outcomes(chain.from_iterable(rows)))
 
     def finished(self) -> dict[RolloutKey, datetime]:
         """Return the time at which each rollout was finished, in UTC."""
-        rows = self._rows("rollouts")
+        rows = self._db.rows("rollouts")
         return {(decode(row["point"]), row["condition"]): datetime.fromisoformat(row["finished"]) for row in rows}
 
     def count(self) -> int:
         """Return the number of finished rollouts."""
-        return self._number("SELECT count(*) FROM rollouts")
+        return self._db.number("SELECT count(*) FROM rollouts")
 
     def completed_batches(self) -> int:
         """Return the number of batches whose evaluations the solver was told."""
@@ -411,7 +278,7 @@ class StudyFile:
     def batches(self) -> int:
         """Return the number of batches of the present solver that have trials."""
         query = "SELECT coalesce(max(batch) + 1, 0) FROM trials WHERE position >= ?"
-        return max(self.completed_batches(), self._number(query, (self._get("first_position", 0),)))
+        return max(self.completed_batches(), self._db.number(query, (self._get("first_position", 0),)))
 
     def rollouts_before(self) -> int:
         """Return the number of rollouts that were finished before the present solver began."""
@@ -426,7 +293,7 @@ class StudyFile:
             complete: Whether the solver was told the evaluations of the batch. Then the trials replace the trials of
                 the batch that an interrupted run has recorded.
         """
-        with self._transaction():
+        with self._db.transaction():
             first = self._get("first_position", 0)
             if complete:
                 self._db.execute("DELETE FROM trials WHERE batch = ? AND position >= ?", (batch, first))
@@ -444,7 +311,7 @@ class StudyFile:
                 )
                 for position, trial in trials.items()
             ]
-            self._insert("trials", rows, instead="REPLACE")
+            self._db.insert("trials", rows, instead="REPLACE")
 
     def begin_anew(self, *, budget: int | None, racing: bool) -> None:
         """Prepare the file for a new solver, with another budget or racing; the trials so far stay.
@@ -453,13 +320,13 @@ class StudyFile:
             budget: The number of rollouts for which the solver is made; None: no limit.
             racing: Whether points race, see `Evaluator`.
         """
-        with self._transaction():
+        with self._db.transaction():
             self._withdraw()
             self._set({"budget": budget, "racing": racing})
 
     def _withdraw(self) -> None:
         """Mark all trials as an earlier solver's."""
-        after = self._number("SELECT coalesce(max(position) + 1, 0) FROM trials")
+        after = self._db.number("SELECT coalesce(max(position) + 1, 0) FROM trials")
         first = max(after, self._get("first_position", 0))
         self._set({"told": 0, "first_position": first, "rollouts_before": self.count()})
 
@@ -477,15 +344,16 @@ class StudyFile:
         Raises:
             StudyError: Another process runs the study.
         """
-        _claimed(self.path, lambda: self._change_code(problem, parts, versions=versions, revision=revision))
+        claimed(self.path, lambda: self._change_code(problem, parts, versions=versions, revision=revision))
 
     def _change_code(
         self, problem: Mapping[str, Any], parts: Sequence[str], *, versions: Mapping[str, str], revision: str
     ) -> None:
-        with self._transaction():
-            failed = {row["point"] for row in self._rows("rollouts") if row["message"].startswith(QUALITY_FAILED)}
+        with self._db.transaction():
+            failed = {row["point"] for row in self._db.rows("rollouts") if row["message"].startswith(QUALITY_FAILED)}
             self._db.execute("DELETE FROM gradients")
-            self._db.executemany("DELETE FROM trials WHERE point = ?", [(point,) for point in failed])
+            for point in failed:
+                self._db.execute("DELETE FROM trials WHERE point = ?", (point,))
             self._db.execute(
                 "DELETE FROM rollouts WHERE substr(message, 1, ?) = ?", (len(QUALITY_FAILED), QUALITY_FAILED)
             )
@@ -500,10 +368,10 @@ class StudyFile:
         Raises:
             StudyError: Another process runs the study.
         """
-        _claimed(self.path, lambda: self._add_conditions(problem))
+        claimed(self.path, lambda: self._add_conditions(problem))
 
     def _add_conditions(self, problem: Mapping[str, Any]) -> None:
-        with self._transaction():
+        with self._db.transaction():
             self._withdraw()
             self._count_up("changes_of_rows")
             for table in ("trials", "gradients"):
@@ -512,19 +380,19 @@ class StudyFile:
 
     def trials(self) -> list[Trial]:
         """Return all trials in the order of the study."""
-        return self._trials(self._rows("trials", "ORDER BY batch, position"), first=0)
+        return self._trials(self._db.rows("trials", "ORDER BY batch, position"), first=0)
 
     # -- what is new, for those who watch
 
     def version(self) -> tuple[int, int]:
         """Return two numbers that differ after any change of the file, by this process or another."""
-        return self._number("PRAGMA data_version"), self._db.total_changes
+        return self._db.version()
 
     @property
     def is_running(self) -> bool:
         """Return whether a process runs the study; of a study in memory, whether its last run has not ended."""
         if self.path is not None:
-            return _is_claimed(self.path)
+            return is_claimed(self.path)
         session = self.last_session()
         return session is not None and session["ended"] is None
 
@@ -555,33 +423,31 @@ class StudyFile:
         """Return rows behind a mark with their numbers; if rows before it are gone, all, with the mark of none."""
         changes = self._get("changes_of_rows", 0)
         # SQLite gives the numbers of rows that are gone to new ones.
-        checksum = self._number(f"SELECT coalesce(max(checksum), 0) FROM {table} WHERE rowid = ?", (mark.row,))
+        checksum = self._db.number(f"SELECT coalesce(max(checksum), 0) FROM {table} WHERE rowid = ?", (mark.row,))
         if (checksum, changes) != (mark.checksum, mark.changes):
             mark = Mark(changes=changes)
         # Rows that are added meanwhile come next time.
-        last = self._number(f"SELECT coalesce(max(rowid), 0) FROM {table}")
+        last = self._db.number(f"SELECT coalesce(max(rowid), 0) FROM {table}")
         which = "WHERE rowid > ? AND rowid <= ? ORDER BY rowid", (mark.row, last)
-        with self._lock, _explained(self.path):
-            numbers = [number for (number,) in self._db.execute(f"SELECT rowid FROM {table} {which[0]}", which[1])]
-        return mark, self._rows(table, *which), numbers
+        return mark, self._db.rows(table, *which), self._db.row_numbers(table, *which)
 
     def earlier_trials(self) -> list[Trial]:
         """Return the trials of earlier solvers, which were made for another budget or another code."""
         first = self._get("first_position", 0)
-        return self._trials(self._rows("trials", "WHERE position < ? ORDER BY batch, position", (first,)), first=0)
+        return self._trials(self._db.rows("trials", "WHERE position < ? ORDER BY batch, position", (first,)), first=0)
 
     def trials_of(self, batch: int) -> list[Trial]:
         """Return the trials of a batch that the present solver asked for."""
         first = self._get("first_position", 0)
-        rows = self._rows("trials", "WHERE batch = ? AND position >= ? ORDER BY position", (batch, first))
-        earlier = self._number("SELECT count(*) FROM trials WHERE batch = ? AND position < ?", (batch, first))
+        rows = self._db.rows("trials", "WHERE batch = ? AND position >= ? ORDER BY position", (batch, first))
+        earlier = self._db.number("SELECT count(*) FROM trials WHERE batch = ? AND position < ?", (batch, first))
         points = [row["point"] for row in rows]
         return self._trials(rows, first=self._trials_before(batch) + earlier, attributes=self._attributes_of(points))
 
     def _trials_before(self, batch: int) -> int:
         """Return the number of trials in the batches before one; while this process runs the study it counts on."""
         since, count = (0, 0) if self._counted is None or self._counted[0] > batch else self._counted
-        count += self._number("SELECT count(*) FROM trials WHERE batch >= ? AND batch < ?", (since, batch))
+        count += self._db.number("SELECT count(*) FROM trials WHERE batch >= ? AND batch < ?", (since, batch))
         if self._counted is not None:
             self._counted = batch, count
         return count
@@ -621,12 +487,12 @@ class StudyFile:
             point: The values of the parameters, in order.
             gradient: Derivatives, by the parameters, of the value that the solver maximizes, shape (n,).
         """
-        with self._transaction():
-            self._insert("gradients", [(encode(point), json.dumps(list(gradient)))], instead="IGNORE")
+        with self._db.transaction():
+            self._db.insert("gradients", [(encode(point), json.dumps(list(gradient)))], instead="IGNORE")
 
     def gradients(self) -> dict[Point, tuple[float, ...]]:
         """Return all gradients by point."""
-        return {decode(point): tuple(json.loads(gradient)) for point, gradient, _ in self._rows("gradients")}
+        return {decode(point): tuple(json.loads(gradient)) for point, gradient, _ in self._db.rows("gradients")}
 
     # -- rollouts that were driven
 
@@ -639,11 +505,11 @@ class StudyFile:
             course: What was driven, from the state at its beginning.
             name: Who drove it.
         """
-        with self._transaction():
-            number = self._number("SELECT coalesce(max(number), 0) + 1 FROM drives")
+        with self._db.transaction():
+            number = self._db.number("SELECT coalesce(max(number), 0) + 1 FROM drives")
             drive = DrivenTrial(number, datetime.now(UTC), name, parameters, outcome, course)
             texts = [json.dumps(part) for part in (parameters, asdict(outcome), course.to_dict())]
-            self._insert("drives", [(number, drive.time.isoformat(), name, *texts)])
+            self._db.insert("drives", [(number, drive.time.isoformat(), name, *texts)])
         return drive
 
     def drives(self, *, after: int = 0) -> list[DrivenTrial]:
@@ -657,7 +523,7 @@ class StudyFile:
                 _outcome_of(json.loads(row["outcome"])),
                 Course.from_dict(json.loads(row["course"])),
             )
-            for row in self._rows("drives", "WHERE number > ? ORDER BY number", (after,))
+            for row in self._db.rows("drives", "WHERE number > ? ORDER BY number", (after,))
         ]
 
     # -- interventions
@@ -678,18 +544,18 @@ class StudyFile:
             name: Who makes them.
             check: Called with the new interventions, which come behind all others; an exception records nothing.
         """
-        with self._transaction():
-            first = self._number("SELECT coalesce(max(number), 0) + 1 FROM interventions")
+        with self._db.transaction():
+            first = self._db.number("SELECT coalesce(max(number), 0) + 1 FROM interventions")
             now = datetime.fromisoformat(_now())
             new = [Intervention(first + k, now, name, kind, payload) for k, payload in enumerate(payloads)]
             check(new)
-            self._insert("interventions", [_row(intervention) for intervention in new])
+            self._db.insert("interventions", [_row(intervention) for intervention in new])
         return new
 
     def copy_interventions(self, interventions: Sequence[Intervention]) -> None:
         """Record interventions of another file as they are."""
-        with self._transaction():
-            self._insert("interventions", [_row(intervention) for intervention in interventions])
+        with self._db.transaction():
+            self._db.insert("interventions", [_row(intervention) for intervention in interventions])
 
     def interventions(self, *, waiting: bool = False, after: int = 0) -> list[Intervention]:
         """Return all interventions, or only those that wait for a batch, in their order, behind one of a number.
@@ -699,16 +565,16 @@ class StudyFile:
             after: The number behind which they begin; 0 for all, as numbers count from 1.
         """
         which = f"WHERE {'batch IS NULL AND ' if waiting else ''}number > ? ORDER BY number"
-        return [_intervention(row) for row in self._rows("interventions", which, (after,))]
+        return [_intervention(row) for row in self._db.rows("interventions", which, (after,))]
 
     def last_interventions(self, count: int) -> list[Intervention]:
         """Return the last ``count`` interventions, in their order."""
-        rows = self._rows("interventions", "ORDER BY number DESC LIMIT ?", (count,))
+        rows = self._db.rows("interventions", "ORDER BY number DESC LIMIT ?", (count,))
         return [_intervention(row) for row in reversed(rows)]
 
     def intervention(self, number: int) -> Intervention | None:
         """Return the intervention of a number; None if there is none."""
-        rows = self._rows("interventions", "WHERE number = ?", (number,))
+        rows = self._db.rows("interventions", "WHERE number = ?", (number,))
         return _intervention(rows[0]) if rows else None
 
     def begin(self, interventions: Sequence[Intervention], *, batch: int) -> list[Intervention]:
@@ -718,10 +584,10 @@ class StudyFile:
             interventions: The interventions.
             batch: The number of the first batch on which they have an effect.
         """
-        with self._transaction():
+        with self._db.transaction():
             waiting = {intervention.number for intervention in self.interventions(waiting=True)}
             begun = [replace(i, batch=batch) for i in interventions if i.number in waiting]
-            self._insert("interventions", [_row(intervention) for intervention in begun], instead="REPLACE")
+            self._db.insert("interventions", [_row(intervention) for intervention in begun], instead="REPLACE")
         return begun
 
     def change_waiting(
@@ -744,7 +610,7 @@ class StudyFile:
         Raises:
             StudyError: No intervention of that number and kind waits.
         """
-        with self._transaction():
+        with self._db.transaction():
             intervention = self.intervention(number)
             if intervention is None or intervention.batch is not None or kind not in (None, intervention.kind):
                 waiting = [i.number for i in self.interventions(waiting=True) if kind in (None, i.kind)]
@@ -755,7 +621,7 @@ class StudyFile:
             self._db.execute("DELETE FROM interventions WHERE number = ?", (number,))
             changed = None if payload is None else replace(intervention, payload=payload)
             if changed is not None:
-                self._insert("interventions", [_row(changed)])
+                self._db.insert("interventions", [_row(changed)])
             if intervention.kind != TRY:
                 self._count_up("changes_of_search")
             check(intervention, changed)
@@ -770,27 +636,21 @@ class StudyFile:
             key: The name of the attribute.
             value: Plain data that JSON can hold; it replaces an earlier value.
         """
-        with self._transaction():
+        with self._db.transaction():
             row = ("" if point is None else encode(point), key, json.dumps(value))
-            self._insert("attributes", [row], instead="REPLACE")
+            self._db.insert("attributes", [row], instead="REPLACE")
 
     def attributes(self) -> dict[Point | None, dict[str, Any]]:
         """Return all attributes by point; the study's attributes under None."""
         by_point: dict[Point | None, dict[str, Any]] = {}
-        for point, key, value, _ in self._rows("attributes", "ORDER BY rowid"):
+        for point, key, value, _ in self._db.rows("attributes", "ORDER BY rowid"):
             by_point.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return by_point
 
     def _attributes_of(self, points: Iterable[str]) -> dict[Point | None, dict[str, Any]]:
         """Return the attributes of encoded points by point."""
-        tables = {point: self._rows("attributes", "WHERE point = ? ORDER BY rowid", (point,)) for point in points}
+        tables = {point: self._db.rows("attributes", "WHERE point = ? ORDER BY rowid", (point,)) for point in points}
         return {decode(point): {r["key"]: json.loads(r["value"]) for r in rows} for point, rows in tables.items()}
-
-
-def _creation(table: str) -> str:
-    """Return the statement that makes a table."""
-    key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
-    return f"CREATE TABLE {table} ({_TABLES[table]}, checksum INTEGER{key})"
 
 
 def _outcomes(rows: Iterable[sqlite3.Row]) -> Iterator[tuple[RolloutKey, Outcome]]:
@@ -819,10 +679,6 @@ def _row(intervention: Intervention) -> tuple[Any, ...]:
     )
 
 
-def _checksum(table: str, row: Sequence[Any]) -> int:
-    return zlib.crc32(repr((table, *row)).encode())
-
-
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
@@ -845,141 +701,6 @@ def _real(value: float) -> float | None:
 def _float(value: float | None) -> float:
     """Return a number of SQLite as a float, the inverse of `_real`."""
     return nan if value is None else value
-
-
-def _sqlite_name(path: Path | None, *, new: bool) -> str:
-    """Return the name for ``sqlite3.connect(..., uri=True)``; None is a database in memory."""
-    if path is None:
-        return ":memory:"
-    path = path.absolute()
-    beside = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
-    unfinished = any(log.exists() and log.stat().st_size > 0 for log in beside)
-    if new or unfinished or os.access(path.parent, os.W_OK, effective_ids=True):
-        return str(path)
-    # With a write-ahead log, SQLite creates files even to read, unless the database is declared immutable.
-    return f"{path.as_uri()}?immutable=1"
-
-
-def _claimed(path: Path | None, use: Callable[[], None]) -> None:
-    """Use a study whose lock this process holds meanwhile; the system releases it when the process dies.
-
-    The lock is a separate file: closing any handle of the study itself would release SQLite's locks on it. (A function
-    and no context manager, so that Ctrl-C cannot leave it held, wherever it comes.)
-    """
-    if path is None:
-        use()
-        return
-    lock = path.with_name(path.name + "-lock")
-    handle, is_owner = -1, False
-    try:
-        while not is_owner:
-            if handle >= 0:
-                os.close(handle)  # Its former owner has removed the file meanwhile.
-            handle = -1
-            try:
-                handle = os.open(lock, os.O_CREAT | os.O_RDWR)
-            except OSError as error:
-                raise StudyError(f"the study {path} cannot be run, as its lock cannot be created: {error}") from error
-            try:
-                _lock_exclusively(handle)
-            except BlockingIOError as error:
-                raise StudyError(
-                    f"the study {path} is being run by another process: wait for it, or give points to it with `add`"
-                ) from error
-            with suppress(FileNotFoundError):
-                is_owner = os.path.samestat(os.fstat(handle), os.stat(lock))
-        use()
-    finally:
-        try:
-            if is_owner:
-                lock.unlink(missing_ok=True)
-        finally:
-            if handle >= 0:
-                os.close(handle)
-
-
-def _lock_exclusively(handle: int) -> None:
-    """Take the lock, which a process that asks `_is_claimed` holds for some microseconds."""
-    for _ in range(10):
-        with suppress(BlockingIOError):
-            return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        time.sleep(0.005)
-    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _is_claimed(path: Path) -> bool:
-    """Return whether a process runs the study."""
-    try:
-        with open(path.with_name(path.name + "-lock")) as lock:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    return False
-
-
-def _refuse_lost_writes(path: Path) -> None:
-    """Refuse a file in whose write-ahead log damage would hide the last writes.
-
-    Raises:
-        StudyError: There is such damage.
-    """
-    if _is_claimed(path):  # It is being written.
-        return
-    with _explained(path):
-        lost = lost_writes(path)
-        if lost is not None:
-            time.sleep(0.05)  # A process that adds points may be about to complete a frame.
-            lost = lost_writes(path)
-    if lost is not None:
-        log = _log_of(path)
-        raise StudyError(
-            f"the write-ahead log {log} is damaged after {lost.readable} bytes, which hides {lost.frames} pages that "
-            f"were written later; it was left unchanged: restore both files from a copy, or cut the log (truncate "
-            f"-s {lost.readable} {log}) to go on without these writes: their rollouts run again"
-        )
-
-
-_CHECK_BOTH = "check the free space of its disk, and the permissions of the file and its folder"
-# What to do, by what SQLite says; anything else may be the disk or the permissions.
-_REMEDIES = {
-    sqlite3.SQLITE_BUSY: f"another process has been writing to it for {PATIENCE:g} s: wait for it, or end it",
-    sqlite3.SQLITE_FULL: "free space on its disk",
-    sqlite3.SQLITE_READONLY: "check the permissions of the file and its folder",
-    sqlite3.SQLITE_CANTOPEN: "check the permissions of the file and its folder",
-}
-
-
-def _code(error: sqlite3.Error) -> int:
-    """Return SQLite's code of an error, without the details of it."""
-    return int(getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)) & 0xFF
-
-
-def _log_of(path: Path) -> Path:
-    return path.with_name(path.name + "-wal")
-
-
-def _damaged(path: Path | None, reason: object) -> StudyError:
-    return StudyError(f"{path} cannot be read ({one_line(reason)}); it was left unchanged: restore it from a copy")
-
-
-@contextmanager
-def _explained(path: Path | None) -> Iterator[None]:
-    """Raise the errors of SQLite as `StudyError`."""
-    try:
-        yield
-    except sqlite3.ProgrammingError as error:
-        raise StudyError(f"the study {path} is closed ({error}): open it again") from error
-    except sqlite3.OperationalError as error:
-        # SQL that SQLite does not understand, or text that it cannot decode, is a sign of damage.
-        code = _code(error)
-        if code == sqlite3.SQLITE_ERROR:
-            raise _damaged(path, error) from error
-        remedy = _REMEDIES.get(code, _CHECK_BOTH)
-        raise StudyError(f"{path} cannot be used ({one_line(error)}); what was recorded is kept: {remedy}") from error
-    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        raise _damaged(path, error) from error
 
 
 def _outcome_of(fields: dict[str, Any]) -> Outcome:
