@@ -179,7 +179,12 @@ class Database:
                     raise
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> None:
-        """Execute a statement within a transaction."""
+        """Execute a statement within a transaction.
+
+        Args:
+            statement: The statement in SQL.
+            values: The values of its question marks.
+        """
         self._db.execute(statement, values)
 
     def insert(self, table: str, rows: Iterable[tuple[Any, ...]], *, instead: str = "ABORT") -> None:
@@ -216,7 +221,13 @@ class Database:
         return rows
 
     def row_numbers(self, table: str, more: str = "", values: Sequence[Any] = ()) -> list[int]:
-        """Return the numbers that SQLite has given the rows that `rows` returns for the same arguments."""
+        """Return the numbers that SQLite has given the rows that `rows` returns for the same arguments.
+
+        Args:
+            table: The name of the table.
+            more: What follows its name in SQL.
+            values: The values of the question marks in ``more``.
+        """
         with self._lock, _explained(self.path):
             numbers = self._patiently(lambda: self._db.execute(f"SELECT rowid FROM {table} {more}", values).fetchall())
         return [number for (number,) in numbers]
@@ -226,7 +237,12 @@ class Database:
         return self.number("PRAGMA data_version"), self._db.total_changes
 
     def number(self, query: str, values: Sequence[Any] = ()) -> int:
-        """Return the single number that a query finds."""
+        """Return the single number that a query finds.
+
+        Args:
+            query: The query in SQL.
+            values: The values of its question marks.
+        """
         with self._lock, _explained(self.path):
             (number,) = self._patiently(lambda: self._db.execute(query, values).fetchone())
         return int(number)
