@@ -1,6 +1,8 @@
 """Codecs of values of the usual types: there and back without a bit lost, and what they refuse."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -19,6 +21,11 @@ class Track:
     count: int
     age: float
     sure: bool
+
+
+class Level(IntEnum):
+    LOW = 1
+    HIGH = 2
 
 
 def back(model, value):
@@ -78,6 +85,82 @@ def test_a_dataclass_keeps_types_and_lengths_that_vary():
 
 
 @dataclass
+class Mixed:
+    """Fields whose defaults have another type than later values, as people write them."""
+
+    total: float = 0
+    flag: int = False
+    level: Level = Level.LOW
+    points: np.ndarray = field(default_factory=lambda: np.zeros(2))
+
+
+@pytest.mark.parametrize("total", [1 / 3, -0.0, 7, True, np.float32(0.1), np.uint64(2**63 + 1)])
+def test_a_field_keeps_numbers_of_another_type_than_its_default(total):
+    found = back(Mixed(), Mixed(total, 3, Level.HIGH))
+    assert type(found.total) is type(total) and repr(found.total) == repr(total)
+    assert found.flag == 3 and type(found.level) is Level and found.level is Level.HIGH
+
+
+@dataclass
+class Longer(Mixed):
+    """A subclass, with a field more."""
+
+    age: float = 0.0
+
+
+def tagged():
+    value = Mixed()
+    value.tag = 1.0
+    return value
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (Mixed(None), "the field total of a Mixed: a number of at most 64 bits is expected here, not None"),
+        (Mixed("1.5"), "the field total of a Mixed: a number of at most 64 bits is expected here, not '1.5'"),
+        (Mixed(1 << 70), "the field total of a Mixed: a number of at most 64 bits"),
+        (Mixed(np.ones(1)), "the field total of a Mixed: a number of at most 64 bits is expected here, not array"),
+        (Mixed(points=None), "the field points of a Mixed: an array of numbers is expected here, not None"),
+        (Mixed(points=[1.0]), "the field points of a Mixed: an array of numbers is expected here, not [1.0]"),
+        (Longer(), "a Mixed is expected here, not Longer("),
+        (None, "a Mixed is expected here, not None"),
+        (tagged(), "the attribute tag of a Mixed would be lost: make it a field"),
+    ],
+)
+def test_a_dataclass_that_would_not_come_back_is_refused(value, told):
+    with pytest.raises(ValueError) as error:
+        codec_of(Mixed()).encode(value)
+    assert told in str(error.value)
+
+
+@dataclass
+class Lazy:
+    """Attributes beside the fields that can be computed again."""
+
+    side: float = 1.0
+
+    def __post_init__(self):
+        self.double = 2.0 * self.side
+
+    @cached_property
+    def area(self):
+        return self.side**2
+
+
+def test_attributes_that_are_computed_again_are_no_fields():
+    value = Lazy(3.0)
+    assert value.area == 9.0
+    found = back(Lazy(), value)
+    assert (found.side, found.double, found.area) == (3.0, 6.0, 9.0)
+
+
+@dataclass
+class Counted:
+    count: int = field(default=0, init=False)
+
+
+@dataclass
 class Named:
     name: str
 
@@ -88,6 +171,7 @@ class Named:
         ([1.0], "there is no codec for a list"),
         (np.array([None]), "there is no codec for a ndarray"),
         (Named("a"), "there is no codec for a Named: its field name is neither an array nor a number, but a str"),
+        (Counted(), "there is no codec for a Counted: its field count is no argument of its constructor"),
         (Track, "there is no codec for a type"),
     ],
 )

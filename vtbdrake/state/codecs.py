@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cached_property
+from inspect import getattr_static
 from typing import Any
 
 import numpy as np
@@ -144,15 +146,27 @@ def _cloud_codec(model: Any) -> Codec:
 
 def _dataclass_codec(model: Any) -> Codec:
     kind = type(model)
-    parts: dict[str, Codec] = {
-        field.name: _part(kind, field.name, getattr(model, field.name)) for field in fields(model)
-    }
+    parts: dict[str, Codec] = {}
+    for field in fields(model):
+        if not field.init:
+            raise ValueError(
+                f"there is no codec for a {kind.__name__}: its field {field.name} is no argument of its constructor; "
+                "give a Codec"
+            )
+        parts[field.name] = _part(kind, field.name, getattr(model, field.name))
+    # What the constructor makes beside the fields, it makes again.
+    attributes = {*parts, *getattr(model, "__dict__", {})}
 
     def encode(value: Any) -> dict[str, np.ndarray]:
+        if type(value) is not kind:
+            raise ValueError(f"a {kind.__name__} is expected here, not {value!r}")
+        for name in getattr(value, "__dict__", {}).keys() - attributes:
+            if not isinstance(getattr_static(kind, name, None), cached_property):
+                raise ValueError(f"the attribute {name} of a {kind.__name__} would be lost: make it a field")
         return {
             f"{name}.{part}" if part else name: array
             for name, codec in parts.items()
-            for part, array in codec.encode(getattr(value, name)).items()
+            for part, array in _encode_part(kind, name, codec, getattr(value, name)).items()
         }
 
     def decode(arrays: Mapping[str, np.ndarray]) -> Any:
@@ -165,12 +179,18 @@ def _dataclass_codec(model: Any) -> Codec:
     return Codec(encode, decode)
 
 
+def _encode_part(owner: type, name: str, codec: Codec, value: Any) -> dict[str, np.ndarray]:
+    try:
+        return codec.encode(value)
+    except ValueError as error:
+        raise ValueError(f"the field {name} of a {owner.__name__}: {error}") from None
+
+
 def _part(owner: type, name: str, value: Any) -> Codec:
     if isinstance(value, np.ndarray):
-        return Codec(lambda value: {"": np.asarray(value)}, lambda arrays: np.asarray(arrays[""]))
+        return _any_array_codec()
     if isinstance(value, bool | int | float):
-        number = type(value)
-        return Codec(lambda value: {"": np.asarray(value)}, lambda arrays: number(arrays[""].item()))
+        return _number_field_codec(value)
     if is_dataclass(value) and not isinstance(value, type):
         return _dataclass_codec(value)
     raise ValueError(
@@ -179,7 +199,29 @@ def _part(owner: type, name: str, value: Any) -> Codec:
     )
 
 
+def _number_field_codec(model: bool | int | float) -> Codec:
+    """Return the codec for a field whose default is ``model``: other numbers keep their own type (``x: float = 0``)."""
+    kind, dtype = type(model), np.asarray(model).dtype
+
+    def encode(value: Any) -> dict[str, np.ndarray]:
+        array = np.asarray(value)
+        if array.ndim or array.dtype.kind not in "biuf":
+            raise ValueError(f"a number of at most 64 bits is expected here, not {value!r}")
+        return {"": array}
+
+    def decode(arrays: Mapping[str, np.ndarray]) -> Any:
+        array = arrays[""]
+        if array.dtype == dtype:
+            return kind(array.item())
+        return array.item() if array.dtype in _PYTHON_NUMBERS else array[()]
+
+    return Codec(encode, decode)
+
+
 Arrays = Mapping[str, np.ndarray]
+
+_PYTHON_NUMBERS = (np.dtype(bool), np.dtype(np.int64), np.dtype(float))
+"""The types that NumPy gives Python's own numbers."""
 
 
 class SnapshotError(ValueError):
