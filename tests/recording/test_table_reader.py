@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from vtbdrake_diagrams.cart_pole import CartPoleScenario
 pytestmark = pytest.mark.one_python
 
 TIMES = np.array([0.0, 0.01, 0.02, 0.03])
+DATES = np.array("2026-01-01", dtype="M8[ns]") + 10 * np.arange(4).astype("m8[ms]")
 Q = np.array([[0.0, 1.0], [10.0, 2.0], [20.0, 3.0], [30.0, 4.5]])
 
 
@@ -131,11 +133,60 @@ def test_newest_sample_is_held() -> None:
         ({"time": TIMES, "q": Q}, {"act": {"q": "q"}}, "q cannot be both"),
         ({"time": TIMES, "q": Q}, {"sense": {"q": "q[2]"}}, r"no q\[2\]: q has the shape \(4, 2\)"),
         ({"time": TIMES, "q": Q}, {"sense": {}}, "at least one signal"),
+        ({"time": TIMES, "q": Q}, {"sense": {"q": []}}, "the signal q has no column"),
+        ({"time": TIMES, "q": Q + 1j}, {}, "the column q is not of numbers: its numbers are complex"),
+        ({"time": [datetime(2026, 1, 1)] * 4, "q": Q}, {}, "time is not of numbers: it is of Python's dates"),
+        ({"time": [timedelta(0)] * 4, "q": Q}, {}, "time is not of numbers: it is of Python's dates or durations"),
+        ({"time": DATES, "q": Q}, {"units": {"time": "ns"}}, "has its own unit: leave the unit ns out"),
+        ({"time": DATES.astype("M8[Y]"), "q": Q}, {}, r"it is of datetime64\[Y\], whose unit is not known"),
+        ({"time": [], "q": []}, {}, "q has no row that is whole"),
+        ({"q": Q}, {"time": 0.0}, "the period: a finite number above 0 s, not 0.0"),
+        ({"q": Q}, {"time": -0.1}, "the period: a finite number above 0 s, not -0.1"),
+        ({"q": Q}, {"time": np.inf}, "the period: a finite number above 0 s, not inf"),
+        ({"q": Q}, {"time": True}, "the period: a finite number above 0 s, not True"),
     ],
 )
 def test_bad_table_is_refused(table: dict[str, object], options: dict[str, object], message: str) -> None:
     with pytest.raises(LogError, match=message):
         read_table(table, **{"sense": {"q": "q"}, **options})
+
+
+def test_columns_of_something_else_are_refused() -> None:
+    with pytest.raises(LogError, match=r"its columns by name \(dict\(frame\)\), not a list"):
+        read_table([[0.0, 1.0]], sense={"q": "q"})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", ["M8[s]", "M8[ms]", "M8[us]", "M8[ns]", "m8[ms]", "m8[ns]", "M8[10us]", "m8[h]"])
+def test_dates_and_durations_are_seconds_whatever_their_unit(dtype: str) -> None:
+    # 3 h later each: a whole number of every unit.
+    times = np.array("2026-01-01T00", dtype="M8[h]") + 3 * np.arange(4)
+    kept = (times if dtype[0] == "M" else times - times[0]).astype(dtype)
+    begin = datetime(2026, 1, 1, tzinfo=UTC).timestamp() if dtype[0] == "M" else 0.0
+    log = read_table({"time": kept, "q": Q}, sense={"q": "q"})
+    assert log.sense["q"].times.tolist() == [begin + 10800.0 * k for k in range(4)]
+
+
+def test_dates_keep_a_fraction_of_a_second_and_dates_that_are_missing_have_no_value(tmp_path: Path) -> None:
+    log = read_table({"time": DATES, "q": Q}, sense={"q": "q"})
+    assert log.sense["q"].times.tolist() == [1767225600.0, 1767225600.01, 1767225600.02, 1767225600.03]
+    ages = np.array([0, 1500, "NaT", 2500], dtype="m8[us]")
+    assert read_table({"time": TIMES, "age": ages}, sense={"age": "age"}).sense["age"].values.T.tolist() == [
+        [0.0, 0.0015, 0.0025]
+    ]
+
+
+def test_parquet_with_time_stamps_is_in_seconds(tmp_path: Path) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    stamps = arrow.array(DATES.astype("M8[us]"), type=arrow.timestamp("us", tz="Europe/Berlin"))
+    parquet.write_table(arrow.table({"time": stamps, "q": Q[:, 0]}), tmp_path / "a.parquet")
+    times = read_table(tmp_path / "a.parquet", sense={"q": "q"}).sense["q"].times
+    assert times.tolist() == [1767225600.0, 1767225600.01, 1767225600.02, 1767225600.03]
+
+
+def test_masked_entry_is_no_sample() -> None:
+    column = np.ma.masked_array([1, 2, 3, 4], mask=[False, True, False, False])
+    series = read_table({"time": TIMES, "q": column}, sense={"q": "q"}).sense["q"]
+    assert series.values.T.tolist() == [[1.0, 3.0, 4.0]]
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from datetime import date, timedelta
 from functools import cache
-from math import pi
+from math import inf, pi
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,10 @@ UNITS: Mapping[str, float] = {
     "mN m": 1e-3, "kN": 1e3, "gauss": 1e-4,
 }  # fmt: skip
 """Factor to SI units, of units that are no SI units; "g" is standard gravity."""
+
+
+_TICKS: Mapping[str, float] = {"ns": 1e9, "us": 1e6, "ms": 1e3, "s": 1.0, "m": 1 / 60, "h": 1 / 3600, "D": 1 / 86400}
+"""Ticks per second of NumPy's dates and durations, by their unit."""
 
 
 def read_table(
@@ -76,16 +81,22 @@ def read_table(
     Raises:
         OSError: The file cannot be read.
         LogError: A column is missing, has another length than its times or is no number; a time is not finite or runs
-            backwards; the format or a unit is unknown.
+            backwards; the format or a unit is unknown; the period is not positive.
         ModuleNotFoundError: The library for the format is not installed.
     """
     act, times, units = act or {}, times or {}, units or {}
+    if not isinstance(source, str | os.PathLike | Mapping):
+        raise LogError(f"a table is a file, or its columns by name (dict(frame)), not a {type(source).__name__}")
+    if not isinstance(time, str) and not _is_period(time):
+        raise LogError(f"time is the name of a column, or the period: a finite number above 0 s, not {time!r}")
     name = "the table" if isinstance(source, Mapping) else os.fspath(source)
     table = source if isinstance(source, Mapping) else _read_file(Path(source))
     if both := sense.keys() & act.keys():
         raise LogError(f"{', '.join(sorted(both))} cannot be both, a sensor signal and an actuator signal")
     _check_keys(times, {*sense, *act}, "times")
     columns = {signal: [each] if isinstance(each, str) else list(each) for signal, each in {**sense, **act}.items()}
+    if empty := next((signal for signal, each in columns.items() if not each), None):
+        raise LogError(f"the signal {empty} has no column")
     entries_of_all = {column for each in columns.values() for column in each}
     _check_keys(units, {*columns, *entries_of_all, *times.values(), str(time)}, "a unit")
     remarks: list[str] = []
@@ -93,7 +104,7 @@ def read_table(
 
     @cache  # Most signals have the same times.
     def times_in(column: str, unit: str | None) -> Array:
-        shared: Array = _column(table, column, name)[:, 0] * _factor(unit)
+        shared: Array = _column(table, column, name, unit)[:, 0] * _factor(unit)
         shared.flags.writeable = False
         return shared
 
@@ -101,8 +112,9 @@ def read_table(
         series = {}
         for signal in signals:
             each, label = columns[signal], f"{name}: {signal}"
-            factors = [_factor(units.get(entry, units.get(signal))) for entry in each]
-            entries = _side_by_side([_column(table, entry, name) for entry in each], factors, label)
+            own_units = [units.get(entry, units.get(signal)) for entry in each]
+            parts = [_column(table, entry, name, unit) for entry, unit in zip(each, own_units, strict=True)]
+            entries = _side_by_side(parts, [_factor(unit) for unit in own_units], label)
             stamps = times.get(signal, time)
             if isinstance(stamps, str):
                 at = times_in(_time_column(table, stamps, each[0]), units.get(stamps))
@@ -117,6 +129,10 @@ def read_table(
     if isinstance(table, MessageTable | LeRobotTable):
         remarks += table.remarks
     return Log(name, read_sense, read_act, remarks)
+
+
+def _is_period(time: object) -> bool:
+    return isinstance(time, int | float | np.number) and not isinstance(time, bool) and bool(0.0 < time < inf)
 
 
 def _side_by_side(columns: Sequence[Array], factors: Sequence[float], label: str) -> Array:
@@ -156,8 +172,8 @@ def _factor(unit: str | None) -> float:
     return UNITS[unit]
 
 
-def _column(table: Table, name: str, source: str) -> Array:
-    """Return a column, (n, k)."""
+def _column(table: Table, name: str, source: str, unit: str | None = None) -> Array:
+    """Return a column, (n, k); ``unit`` is what it has by the caller."""
     base, bracket, index = name.partition("[")
     if name in table:
         column = table[name]
@@ -172,12 +188,40 @@ def _column(table: Table, name: str, source: str) -> Array:
         near = did_you_mean(name, table, cutoff=0.5)
         raise LogError(f"{source} has no column {name!r}{near}; it has: {shown or 'none'}{remarks}")
     try:
-        values: Array = np.asarray(column, dtype=float)
+        values = _floats(column, unit)
     except (TypeError, ValueError) as error:
-        raise LogError(f"{source}: the column {name} is not of numbers: {_first_text(column) or error}") from None
+        reason = _first_text(column) or str(error)
+        raise LogError(f"{source}: the column {name} is not of numbers: {reason}") from None
     if values.ndim not in (1, 2):
         raise LogError(f"{source}: the column {name} has the shape {values.shape}, not (n,) or (n, k)")
-    return values.reshape(len(values), -1)
+    return values.reshape(len(values), -1 if values.size else (values.shape[1:] or (1,))[0])
+
+
+def _floats(column: Any, unit: str | None) -> Array:
+    """Return a column as floats: NaN where it is masked, dates and durations in s.
+
+    Raises:
+        TypeError: It is of complex numbers or of objects, or has a unit although its type has one.
+        ValueError: It is of texts.
+    """
+    if isinstance(column, np.ma.MaskedArray):
+        return np.where(np.ma.getmaskarray(column), np.nan, _floats(column.data, unit))
+    kept = np.asarray(column)
+    if kept.dtype.kind == "c":
+        raise TypeError("its numbers are complex; give real and imaginary part as two columns")
+    if any(isinstance(entry, date | timedelta) for entry in kept.ravel()[:1]):
+        raise TypeError("it is of Python's dates or durations; give numbers, or numpy.datetime64 in UTC")
+    if kept.dtype.kind not in "mM":
+        return np.asarray(column, dtype=float)
+    if unit is not None:
+        raise TypeError(f"it is of {kept.dtype}, which has its own unit: leave the unit {unit} out")
+    tick, count = np.datetime_data(kept.dtype)
+    if tick not in _TICKS:
+        raise TypeError(f"it is of {kept.dtype}, whose unit is not known in s")
+    ticks = kept.astype(np.int64) * count
+    whole, rest = np.divmod(ticks, round(_TICKS[tick])) if _TICKS[tick] > 1.0 else (0, ticks)
+    seconds = whole + rest / _TICKS[tick]  # As its fraction is computed for itself, it is the nearest float.
+    return np.where(np.isnat(kept), np.nan, seconds)
 
 
 def _first_text(column: Any) -> str:
