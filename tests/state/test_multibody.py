@@ -2,8 +2,16 @@
 
 import numpy as np
 import pytest
+from pydrake.geometry import AddContactMaterial, GeometryInstance, ProximityProperties, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.fem import DeformableBodyConfig
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    DistanceConstraintParams,
+    MultibodyPlant,
+)
 from pydrake.multibody.tree import (
     BallRpyJoint,
     PlanarJoint,
@@ -14,10 +22,11 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UniversalJoint,
 )
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from tests.testbeds import ACROBOT
-from vtbdrake.state import collect
+from vtbdrake.state import Snapshot, VariableError, collect, snapshot
 from vtbdrake.state.multibody import multibody_variables
 
 INERTIA = [0.2, 0.3, 0.4, 0.01, -0.02, 0.03]
@@ -134,3 +143,93 @@ def test_a_name_that_model_and_body_share_stands_once():
     plant.Finalize()
     poses = {variable.address for variable in multibody_variables(plant) if variable.address.endswith(".pose")}
     assert poses == {"quad.frame.pose", "box.pose"}
+
+
+def linked():
+    """Two masses on slides with a rod and a coupler between them, and a deformable ball."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001)
+    plant.set_name("plant")
+    slides = []
+    for name in ("a", "b"):
+        body = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        slides.append(
+            plant.AddJoint(PrismaticJoint(f"slide_{name}", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+        )
+    slides[1].set_default_translation(0.5)
+    a, b = plant.GetBodyByName("a"), plant.GetBodyByName("b")
+    rod = plant.AddDistanceConstraint(a, [0, 0, 0], b, [0, 0, 0], 0.5)
+    coupler = plant.AddCouplerConstraint(slides[0], slides[1], 2.0, -1.0)
+    properties = ProximityProperties()
+    AddContactMaterial(dissipation=1.0, friction=CoulombFriction(0.5, 0.5), properties=properties)
+    ball = GeometryInstance(RigidTransform([0, 0, 3]), Sphere(0.1), "ball")
+    ball.set_proximity_properties(properties)
+    plant.mutable_deformable_model().RegisterDeformableBody(ball, DeformableBodyConfig(), 1.0)
+    plant.Finalize()
+    diagram = builder.Build()
+    return plant, diagram, collect(diagram), (rod, coupler)
+
+
+def open_rod(plant, context, constraints):
+    plant.SetConstraintActiveStatus(context, constraints[0], False)
+
+
+def open_coupler(plant, context, constraints):
+    plant.SetConstraintActiveStatus(context, constraints[1], False)
+
+
+def lengthen_rod(plant, context, constraints):
+    was = plant.GetDistanceConstraintParams(context, constraints[0])
+    rod = DistanceConstraintParams(was.bodyA(), [0, 0.1, 0], was.bodyB(), [0, -0.1, 0.2], 0.7, 300.0, 2.0)
+    plant.SetDistanceConstraintParams(context, constraints[0], rod)
+
+
+def disable_ball(plant, context, constraints):
+    model = plant.deformable_model()
+    model.GetBodyByName("ball").Disable(context)
+
+
+@pytest.mark.parametrize("change", [open_rod, open_coupler, lengthen_rod, disable_ball])
+def test_what_drake_keeps_in_abstract_parameters_is_part_of_snapshots_and_copies(change):
+    plant, diagram, variables, constraints = linked()
+    context, changed = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
+    plant_context = plant.GetMyMutableContextFromRoot(changed)
+    plant.SetVelocities(plant_context, plant.GetVelocities(plant_context) + 0.1)
+    copy = context.Clone()
+    plant.SetVelocities(plant.GetMyMutableContextFromRoot(copy), plant.GetVelocities(plant_context))
+    change(plant, plant_context, constraints)
+
+    other_plant, other, other_variables, _ = linked()
+    restored, copied = other.CreateDefaultContext(), other.CreateDefaultContext()
+    taken = snapshot.take(diagram, changed, variables)
+    snapshot.apply(Snapshot.load(taken.to_bytes()), other, restored, other_variables)
+    snapshot.StateCopier(diagram, variables, other, other_variables).copy(changed, copied)
+
+    def moved(diagram, plant, context):
+        Simulator(diagram, context).AdvanceTo(0.05)
+        return plant.get_state_output_port().Eval(
+            plant.GetMyContextFromRoot(context)
+        ), plant.deformable_model().GetPositions(
+            plant.GetMyContextFromRoot(context), plant.deformable_model().GetBodyByName("ball").body_id()
+        )
+
+    truth, without = moved(diagram, plant, changed), moved(diagram, plant, copy)
+    assert any(not np.array_equal(*pair) for pair in zip(truth, without, strict=True))  # It makes a difference.
+    for found in (restored, copied):
+        for expected, pair in zip(truth, moved(other, other_plant, found), strict=True):
+            np.testing.assert_array_equal(pair, expected)
+
+
+def test_rod_is_changed_by_its_variables():
+    plant, diagram, variables, (rod, _) = linked()
+    context = diagram.CreateDefaultContext()
+    assert variables["plant.constraint_0.stiffness"].get(context) == 0.0  # rigid
+    variables["plant.constraint_0.distance"].set(context, 0.8)
+    variables["plant.constraint_0.points[4]"].set(context, 0.3)
+    params = plant.GetDistanceConstraintParams(plant.GetMyContextFromRoot(context), rod)
+    assert (params.distance(), params.stiffness(), params.p_BQ().tolist()) == (0.8, np.inf, [0.0, 0.3, 0.0])
+    variables["plant.constraint_0.stiffness"].set(context, 70.0)
+    assert plant.GetDistanceConstraintParams(plant.GetMyContextFromRoot(context), rod).stiffness() == 70.0
+    for address, value in {"distance": 0.0, "stiffness": -1.0, "active": 0.5}.items():
+        with pytest.raises(VariableError, match=f"plant.constraint_0.{address}"):
+            variables[f"plant.constraint_0.{address}"].set(context, value)

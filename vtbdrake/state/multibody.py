@@ -1,4 +1,4 @@
-"""The variables of a MultibodyPlant: its joints, bodies, frames, actuators and contact friction."""
+"""The variables of a MultibodyPlant: its joints, bodies, frames, actuators, constraints and contact friction."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import GeometryId, ProximityProperties, RoleAssign, SceneGraph, SceneGraphInspector
 from pydrake.math import RollPitchYaw
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import CoulombFriction, DistanceConstraintParams, MultibodyPlant
 from pydrake.multibody.tree import (
+    DeformableBody,
     FixedOffsetFrame,
     FrameIndex,
     Joint,
     JointActuator,
     ModelInstanceIndex,
+    MultibodyConstraintId,
     RigidBody,
     SpatialInertia,
     UnitInertia,
@@ -49,6 +51,7 @@ _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
 # What is derived from the pose of a body, with its units: the entries of [x, y, z, roll, pitch, yaw].
 POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
 _FRICTION = ("material", "coulomb_friction")
+_ROD = ("bodyA", "p_AP", "bodyB", "p_BQ", "distance", "stiffness", "damping")  # of a distance constraint
 
 
 def _within_plant(instance: str) -> str:
@@ -83,6 +86,9 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix = _within_plant
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
         yield _rotor_inertia(plant, actuator, element_address(plant, actuator, prefix))
+    if plant.num_constraints():
+        yield from _constraint_variables(plant, prefix(plant.GetModelInstanceName(default_model_instance())))
+    yield from _deformable_variables(plant, prefix)
 
 
 def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str, Callable[[], Variable]]:
@@ -114,7 +120,7 @@ def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 
 def element_address(
     plant: MultibodyPlant,
-    element: RigidBody | Joint | FixedOffsetFrame | JointActuator,
+    element: RigidBody | DeformableBody | Joint | FixedOffsetFrame | JointActuator,
     prefix: Prefix = _within_plant,
 ) -> str:
     """Return the address ``prefix.instance.element``, without an instance that Drake itself has named.
@@ -198,10 +204,6 @@ def _variable(
 
 
 def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
-    def refuse(value: np.ndarray) -> None:
-        if float(value) not in (0.0, 1.0):
-            raise VariableError(f"{address} is 0 (free) or 1 (locked), but the value given is {float(value):g}")
-
     def write(context: Context, value: np.ndarray) -> None:
         if value:
             joint.Lock(context)  # This sets the joint's velocity to zero, as Drake requires.
@@ -209,8 +211,107 @@ def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
             joint.Unlock(context)
 
     # Written last: locking stops the joint, and a locked joint takes no velocity.
-    return _variable(plant, address, A, (), "1", joint.is_locked, write, bounds=(0.0, 1.0), carried_by=address, order=1,
+    return _flag(plant, address, "0 (free) or 1 (locked)", joint.is_locked, write, order=1)
+
+
+def _flag(
+    plant: MultibodyPlant,
+    address: str,
+    meaning: str,
+    read: Callable[[Context], bool],
+    write: Callable[[Context, np.ndarray], None],
+    order: int = 0,
+) -> Variable:
+    """Return a hidden variable that is 0 or 1."""
+
+    def refuse(value: np.ndarray) -> None:
+        if float(value) not in (0.0, 1.0):
+            raise VariableError(f"{address} is {meaning}, but the value given is {float(value):g}")
+
+    return _variable(plant, address, A, (), "1", read, write, bounds=(0.0, 1.0), carried_by=address, order=order,
                      refuse=refuse)  # fmt: skip
+
+
+def _constraint_variables(plant: MultibodyPlant, prefix: str) -> Iterator[Variable]:
+    """Yield for each constraint, which Drake gives no name, whether it is active, and the rod of a distance constraint.
+
+    Drake keeps them in abstract parameters, which no copy of the numeric groups contains.
+    """
+
+    def active(constraint: MultibodyConstraintId, address: str) -> Variable:
+        return _flag(
+            plant,
+            f"{address}.active",
+            "0 (not active) or 1 (active)",
+            lambda context: plant.GetConstraintActiveStatus(context, constraint),
+            lambda context, value: plant.SetConstraintActiveStatus(context, constraint, bool(value)),
+        )
+
+    distances = plant.GetDefaultDistanceConstraintParams()
+    for number, constraint in enumerate(sorted(plant.GetConstraintIds(), key=MultibodyConstraintId.get_value)):
+        address = f"{prefix}.constraint_{number}" if prefix else f"constraint_{number}"
+        yield active(constraint, address)
+        if constraint in distances:
+            yield from _rod_variables(plant, constraint, address)
+
+
+def _rod_variables(plant: MultibodyPlant, constraint: MultibodyConstraintId, address: str) -> Iterator[Variable]:
+    """Yield what a distance constraint holds; its stiffness is 0 where the rod is rigid, as no variable is infinite."""
+
+    def entries(context: Context) -> dict[str, Any]:
+        params = plant.GetDistanceConstraintParams(context, constraint)
+        return {name: getattr(params, name)() for name in _ROD}
+
+    def change(context: Context, **changed: Any) -> None:
+        params = DistanceConstraintParams(**{**entries(context), **changed})
+        plant.SetDistanceConstraintParams(context, constraint, params)
+
+    def read_stiffness(context: Context) -> float:
+        stiffness = float(entries(context)["stiffness"])
+        return stiffness if stiffness < inf else 0.0
+
+    def read_points(context: Context) -> np.ndarray:
+        rod = entries(context)
+        return np.concatenate([rod["p_AP"], rod["p_BQ"]])
+
+    def refuse_zero(value: np.ndarray) -> None:
+        if value <= 0.0:
+            raise VariableError(f"{address}.distance is above 0 m, but the value given is {float(value):g}")
+
+    def variable(name: str, *args: Any, **options: Any) -> Variable:
+        return _variable(plant, f"{address}.{name}", A, *args, carried_by=f"{address}.{name}", **options)
+
+    yield variable("distance", (), "m", lambda context: entries(context)["distance"],
+                   lambda context, value: change(context, distance=float(value)), bounds=(0.0, inf),
+                   refuse=refuse_zero)  # fmt: skip
+    yield variable("stiffness", (), "N/m", read_stiffness,
+                   lambda context, value: change(context, stiffness=float(value) or inf),
+                   bounds=(0.0, inf))  # fmt: skip
+    yield variable("damping", (), "N s/m", lambda context: entries(context)["damping"],
+                   lambda context, value: change(context, damping=float(value)), bounds=(0.0, inf))  # fmt: skip
+    yield variable("points", (6,), "m", read_points,
+                   lambda context, value: change(context, p_AP=value[:3], p_BQ=value[3:]),
+                   entry_names=("a_x", "a_y", "a_z", "b_x", "b_y", "b_z"))  # fmt: skip
+
+
+def _deformable_variables(plant: MultibodyPlant, prefix: Prefix) -> Iterator[Variable]:
+    """Yield for each deformable body whether it is enabled, which Drake keeps in an abstract parameter."""
+    model = plant.deformable_model()
+    if not model.num_bodies():
+        return
+
+    def enabled(body: DeformableBody) -> Variable:
+        return _flag(
+            plant,
+            f"{element_address(plant, body, prefix)}.enabled",
+            "0 (disabled) or 1 (enabled)",
+            body.is_enabled,
+            lambda context, value: body.Enable(context) if value else body.Disable(context),
+        )
+
+    for instance in map(ModelInstanceIndex, range(plant.num_model_instances())):
+        for body in map(model.GetBody, model.GetBodyIds(instance)):
+            yield enabled(body)
 
 
 def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Iterator[Variable]:

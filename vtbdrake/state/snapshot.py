@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from vtbdrake.common.argument_checks import check_plain
 from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.codecs import SnapshotError, abstract_state
-from vtbdrake.state.systems import leaves, read_group, stateful_leaves, write_group
+from vtbdrake.state.systems import is_plant, leaves, read_group, stateful_leaves, write_group
 from vtbdrake.state.variables import VariableError, Variables, html_table
 
 KIND = "vtbdrake snapshot"
@@ -284,9 +284,15 @@ class StateCopier:
         """
         target.SetTime(source.get_time())
         for from_system, to_system in self._pairs:
-            to_system.GetMyMutableContextFromRoot(target).SetStateAndParametersFrom(
-                from_system.GetMyContextFromRoot(source)
-            )
+            to_context = to_system.GetMyMutableContextFromRoot(target)
+            # A plant's constraints have other ids in each build. Their parameters are hidden variables, as are all
+            # others of a plant that are abstract.
+            has_ids = from_system is not to_system and is_plant(to_system) and to_system.num_constraints() > 0
+            numbers = range(to_context.num_abstract_parameters() if has_ids else 0)
+            kept = [to_context.get_abstract_parameter(number).Clone() for number in numbers]
+            to_context.SetStateAndParametersFrom(from_system.GetMyContextFromRoot(source))
+            for number, value in zip(numbers, kept, strict=True):
+                to_context.get_mutable_abstract_parameter(number).SetFrom(value)
         for from_variable, to_variable in self._hidden:
             if hidden is not None and to_variable.address not in hidden:
                 continue
