@@ -9,6 +9,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from vtbdrake.project import RobotFileError, add_model, read_robot, write_project
 from vtbdrake.project.meshes import convert
+from vtbdrake.project.model_faults import faults
+from vtbdrake.project.model_scenario import ModelFileScenario
 from vtbdrake.project.xml_text import XmlText
 
 pytestmark = pytest.mark.one_python
@@ -184,6 +186,80 @@ NOTHING = INERTIA.replace("0.01", "0")
 def test_what_drake_refuses_is_mended_with_a_note(tmp_path: Path, arm: str, further: str, note: str) -> None:
     robot = read_robot(urdf(tmp_path, arm=arm, further=further))
     assert any(text.partition("robot.urdf")[1:] and note in text for text in robot.notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('mass value="1"', 'mass value="1,5"', "robot.urdf:2: the value '1,5' has a comma, at which Drake stops"),
+        ('izz="0.01"', 'izz="0,02"', "robot.urdf:2: the izz '0,02' has a comma"),
+        ('axis xyz="0 1 0"', 'axis xyz="0,0 1 0"', "robot.urdf:4: the xyz '0,0 1 0' has a comma"),
+        ('upper="1"', 'upper="-,5e0"', "robot.urdf:4: the upper '-,5e0' has a comma"),
+        ('mass value="1"', 'mass value="-1"', "robot.urdf:2: the mass of base is '-1': give a number that is not"),
+        ('mass value="1"', 'mass value="nan"', "robot.urdf:2: the mass of base is 'nan'"),
+        ('mass value="1"', 'mass value="1.5kg"', "robot.urdf:2: the mass of base is '1.5kg'"),
+        ('mass value="1"', 'mass value="${m}"', "robot.urdf:2: ${m} is of xacro, which Drake does not know"),
+        ("</robot>", '<xacro:include filename="hand.xacro"/></robot>', "robot.urdf:6: <xacro:include> is of xacro"),
+        ('lower="-1"', 'lower="2"', "robot.urdf:4: the range of hinge is empty, 2 to 1: give it a lower"),
+        ("</robot>", '<link name="arm"/></robot>', "robot.urdf:6: a second link arm, after the one in line 3"),
+        ("</robot>", f"{HINGE}</robot>", "robot.urdf:6: a second joint hinge, after the one in line 4"),
+    ],
+)
+def test_what_drake_would_read_wrongly_is_refused_with_its_line(tmp_path: Path, old: str, new: str, told: str) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(RobotFileError) as error:
+        read_robot(path)
+    assert told in str(error.value)
+    with pytest.raises(RobotFileError) as error:
+        ModelFileScenario(file=str(path)).build()
+    assert told in str(error.value)
+
+
+SDF = """<sdf version="1.9"><model name="m"><link name="a"><inertial><mass>1</mass></inertial></link>
+<joint name="j" type="revolute"><parent>world</parent><child>a</child><axis><xyz>0 0 1</xyz>
+<limit><lower>-1</lower><upper>1</upper></limit></axis></joint></model></sdf>"""
+MJCF = """<mujoco><worldbody><body name="a"><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+<joint range="-1 1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "told"),
+    [
+        (SDF, "<mass>1<", "<mass>1,5<", "m.sdf:1: the mass '1,5' has a comma"),
+        (SDF, "<mass>1<", "<mass><", "m.sdf:1: the mass of a is ''"),
+        (SDF, "<lower>-1<", "<lower>3<", "m.sdf:2: the range of j is empty, 3 to 1"),
+        (SDF, "<xyz>0 0 1<", "<xyz>0,0 0 1<", "m.sdf:2: the xyz '0,0 0 1' has a comma"),
+        (MJCF, 'mass="1"', 'mass="1,5"', "m.xml:1: the mass '1,5' has a comma"),
+        (MJCF, 'mass="1"', 'mass="-1"', "m.xml:1: the mass of a is '-1'"),
+        (MJCF, 'range="-1 1"', 'range="1 -1"', "m.xml:2: the range of a joint is empty, 1 to -1"),
+    ],
+)
+def test_faults_of_sdf_and_mjcf_are_told(tmp_path: Path, text: str, old: str, new: str, told: str) -> None:
+    path = tmp_path / ("m.sdf" if text is SDF else "m.xml")
+    read_faults = [text for _, text in faults(XmlText(text.encode()).root)]
+    assert not read_faults
+    path.write_text(text.replace(old, new))
+    with pytest.raises(RobotFileError) as error:
+        read_robot(path)
+    assert told in str(error.value)
+
+
+def test_commas_that_are_no_numbers_are_left_alone() -> None:
+    text = (
+        '<robot name="1,2"><link name="3,4"/><gazebo><update>1,5</update></gazebo><a note="1, 2 or so">x, y</a></robot>'
+    )
+    assert not list(faults(XmlText(text.encode()).root))
+
+
+def test_names_with_emoji_are_python(tmp_path: Path) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace('"hinge"', '"\U0001f9be"').replace('"arm"', '"\U0001f916 a"'), "utf-8")
+    write_project(tmp_path, "hand", read_robot(path))
+    text = (tmp_path / "hand" / "hand" / "robot.py").read_text("utf-8")
+    namespace: dict[str, object] = {"__file__": str(tmp_path / "hand" / "hand" / "robot.py"), "__name__": "hand.robot"}
+    exec(compile(text, "robot.py", "exec"), namespace)
+    assert namespace["DRIVEN"] == ["\U0001f9be"]
 
 
 def test_links_without_moments_of_inertia_get_those_of_a_sphere(tmp_path: Path) -> None:

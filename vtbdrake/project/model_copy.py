@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vtbdrake.project.meshes import CONVERTED, MeshError, can_convert, convert
+from vtbdrake.project.model_faults import faults
 from vtbdrake.project.xml_text import XmlElement, XmlText
 
 _MODEL_SUFFIXES = "urdf|sdf|xml|obj|mtl|stl|dae|ply|gltf|glb|bin|vtk|png|jpe?g|ktx2|tga|bmp"
@@ -33,6 +34,8 @@ _DENSITY = 1000.0
 # What a body without mass gets, in kg and kg m^2.
 _NO_MASS = 1e-9
 _NO_INERTIA = 1e-12
+# How many faults an error names.
+_SHOWN = 3
 
 
 @dataclass
@@ -49,6 +52,7 @@ class ModelCopy:
         missing: The packages that were not found, each with the sentence that says what to do.
         assumptions: What the file does not give, each with the values that are assumed instead.
         notes: What was changed, each with file and line.
+        fault: What is wrong in the files and cannot be mended, with file, line and remedy; empty if nothing is.
     """
 
     model: Path
@@ -60,6 +64,7 @@ class ModelCopy:
     missing: dict[str, str] = field(default_factory=dict)
     assumptions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    fault: str = ""
 
     def write(self, folder: Path) -> Path:
         """Write the files into a folder, and return the path of the model file there."""
@@ -95,6 +100,8 @@ class _Copier:
         self._assumed: list[tuple[str, str, str]] = []  # place, link, moment of inertia
 
     def copy(self) -> ModelCopy:
+        every = [(source, *fault) for source, xml in self._texts.items() for fault in faults(xml.root)]
+        fault = "; ".join(f"{self._place(source, element)}: {text}" for source, element, text in every[:_SHOWN])
         for source, xml in self._texts.items():
             self._mend(source, xml)
         self._convert_meshes()
@@ -123,6 +130,7 @@ class _Copier:
             missing=self._missing,
             assumptions=self._assumptions(),
             notes=self._notes,
+            fault=fault,
         )
 
     def _assumptions(self) -> list[str]:

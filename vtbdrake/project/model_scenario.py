@@ -165,6 +165,8 @@ def _readable(file: str, packages: tuple[tuple[str, str], ...]) -> tuple[Path, d
                 break
         return path, {name: Path(around.GetPath(name)) for name in around.GetPackageNames()} | named
     copy = copy_model(path.resolve(), file, named)
+    if copy.fault:
+        raise RobotFileError(copy.fault)
     for name, remedy in copy.missing.items():
         raise RobotFileError(f"{file} refers to the package {name}: {remedy}")
     temporary = tempfile.TemporaryDirectory(prefix="vtbdrake-view-")

@@ -80,6 +80,8 @@ class ModelParser:
         self.text = self.path.read_text(encoding="utf-8", errors="replace")
         self.folder = folder
         self.copy = copy_model(self.path, self.shown, packages)
+        if self.copy.fault:
+            raise RobotFileError(self.copy.fault)
         self.notes: list[str] = list(self.copy.notes)
         self._written = self.copy.write(folder)
         self._folders = {name: folder / root for name, root in self.copy.packages.items()}

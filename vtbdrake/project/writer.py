@@ -148,7 +148,7 @@ def _section(title: str, items: Sequence[str]) -> str:
 
 def _flying_values(robot: ProjectRobot, flying: FlyingRobot) -> dict[str, str]:
     rotors = [
-        f"    {json.dumps(rotor.name)}: Rotor(position={_point(rotor.position)}, moment={_number(rotor.moment)}, "
+        f"    {_text(rotor.name)}: Rotor(position={_point(rotor.position)}, moment={_number(rotor.moment)}, "
         f"most={_number(rotor.most)}),\n"
         for rotor in flying.rotors
     ]
@@ -159,7 +159,7 @@ def _flying_values(robot: ProjectRobot, flying: FlyingRobot) -> dict[str, str]:
         "model_file": robot.model.name,
         "model_path": robot.model.as_posix(),
         "add_robot": "".join(f"    {line}\n" for line in _add_robot(robot)),
-        "base": json.dumps(flying.base),
+        "base": _text(flying.base),
         "height": _number(flying.height),
         "rotors": "".join(rotors),
         "position_unit": "m",
@@ -190,17 +190,17 @@ def _robot_values(robot: ProjectRobot) -> dict[str, str]:
         "robot_imports": _robot_imports(robot),
         "assumed_comment": "\n# What the file does not say is assumed." if any(j.assumed for j in robot.joints) else "",
         "joints": "\n".join(map(_joint, robot.joints)),
-        "driven": _list("DRIVEN = ", [json.dumps(name) for name in robot.driven]),
+        "driven": _list("DRIVEN = ", [_text(name) for name in robot.driven]),
         "examples": _examples(robot),
         "reached": f"{0.8 * robot.standing.reached:.2f}" if robot.standing is not None else "",
         "B": _motions(robot),
         "couplings": "".join(
-            f"B[list(JOINTS).index({json.dumps(c.joint)}), DRIVEN.index({json.dumps(c.leader)})] = "
+            f"B[list(JOINTS).index({_text(c.joint)}), DRIVEN.index({_text(c.leader)})] = "
             f"{_number(c.multiplier)}  # it follows\n"
             for c in robot.couplings
         ),
         "touching": "\n# Bodies that touch each other at home, without contact.\n"
-        f"TOUCHING = {_list('TOUCHING = ', [json.dumps(name) for name in robot.touching])}\n"
+        f"TOUCHING = {_list('TOUCHING = ', [_text(name) for name in robot.touching])}\n"
         if robot.touching
         else "",
         "add_robot": "".join(f"    {line}\n" for line in _add_robot(robot)),
@@ -270,11 +270,11 @@ def _examples(robot: ProjectRobot) -> str:
         return f"# Another posture of these joints, for examples.\nAWAY = {away}\n"
     stance = standing.stance([])
     feet = "".join(_foot(name, points) for name, points in standing.feet.items())
-    soles = "".join(f"    {json.dumps(name)}: np.array({_row(up)}),\n" for name, up in standing.soles.items())
+    soles = "".join(f"    {_text(name)}: np.array({_row(up)}),\n" for name, up in standing.soles.items())
     direction = "left" if standing.direction == (0.0, 1.0) else "front"
     return (
         "# The trunk, and its pose when the robot stands: a quaternion wxyz, and the position over the ground in m.\n"
-        f"BASE = {json.dumps(standing.base)}\n"
+        f"BASE = {_text(standing.base)}\n"
         f"X_WB = np.array({_row(stance.X_WB)})\n"
         "# The contact points of the feet, in the frame of each, in m.\n"
         f"FEET = {{\n{feet}}}\n"
@@ -293,11 +293,11 @@ def _row(values: NDArray[np.float64]) -> str:
 
 def _foot(name: str, points: NDArray[np.float64]) -> str:
     """Return the entry of FEET: the contact points of a foot."""
-    line = f"    {json.dumps(name)}: np.array([{', '.join(map(_row, points))}]),\n"
+    line = f"    {_text(name)}: np.array([{', '.join(map(_row, points))}]),\n"
     if len(line) <= _LONGEST_LINE + 1:  # with its end
         return line
     rows = "".join(f"            {_row(point)},\n" for point in points)
-    return f"    {json.dumps(name)}: np.array(\n        [\n{rows}        ]\n    ),\n"
+    return f"    {_text(name)}: np.array(\n        [\n{rows}        ]\n    ),\n"
 
 
 def _motions(robot: ProjectRobot) -> str:
@@ -319,7 +319,7 @@ def _joint(joint: RobotJoint) -> str:
     numbers |= {"home": joint.home} if joint.home else {}
     arguments = ", ".join(f"{field}={_number(value)}" for field, value in numbers.items())
     comment = f"    # assumed: {', '.join(joint.assumed)}\n" if joint.assumed else ""
-    return f"{comment}    {json.dumps(joint.name)}: Joint({arguments}),"
+    return f"{comment}    {_text(joint.name)}: Joint({arguments}),"
 
 
 def _list(prefix: str, items: Sequence[str]) -> str:
@@ -352,16 +352,16 @@ def _is_identity(X: RigidTransform) -> bool:
 def _add_robot(robot: ProjectRobot) -> list[str]:
     """Return the lines that turn the plant of the file into the project's plant."""
     up = len(robot.model.parts) - 1
-    folders = [f'{json.dumps(name)}: MODEL.parents[{up}] / "{path}"' for name, path in robot.packages.items()]
+    folders = [f'{_text(name)}: MODEL.parents[{up}] / "{path}"' for name, path in robot.packages.items()]
     lines = [f"add_model(plant, MODEL, {{{', '.join(folders)}}})" if folders else "add_model(plant, MODEL)"]
     for name, X_WB in robot.welded.items():
         pose = "" if _is_identity(X_WB) else ", X_WB"
         lines += [f"X_WB = {_pose(X_WB)}"] if pose else []
-        frame = f"plant.GetBodyByName({json.dumps(name)}).body_frame()"
+        frame = f"plant.GetBodyByName({_text(name)}).body_frame()"
         lines.append(f"plant.WeldFrames(plant.world_frame(), {frame}{pose})")
     if robot.held:
         lines += [
-            f"for name in [{', '.join(json.dumps(name) for name in robot.held)}]:",
+            f"for name in [{', '.join(_text(name) for name in robot.held)}]:",
             "    hold_joint(plant, name)  # Nothing drives it.",
         ]
     if robot.standing is not None:
@@ -370,17 +370,17 @@ def _add_robot(robot: ProjectRobot) -> list[str]:
             "plant.SetDefaultFloatingBaseBodyPose(base, RigidTransform(X_WB[4:]))",
         ]
     lines += [
-        f"plant.RemoveJointActuator(plant.GetJointActuatorByName({json.dumps(name)}))  # it follows another joint"
+        f"plant.RemoveJointActuator(plant.GetJointActuatorByName({_text(name)}))  # it follows another joint"
         for name in robot.without_drive
     ]
     if robot.servos:
         lines += [
-            f"for name in [{', '.join(json.dumps(name) for name in robot.servos)}]:",
+            f"for name in [{', '.join(_text(name) for name in robot.servos)}]:",
             "    replace_servo(plant, name)  # The DPS commands torques or forces, not positions or velocities.",
         ]
     if robot.added_drives:
         is_all = robot.added_drives == robot.driven
-        names = "DRIVEN" if is_all else _list("for name in :    ", [json.dumps(name) for name in robot.added_drives])
+        names = "DRIVEN" if is_all else _list("for name in :    ", [_text(name) for name in robot.added_drives])
         lines += [
             *f"for name in {names}:".splitlines(),
             "    plant.AddJointActuator(name, plant.GetJointByName(name), JOINTS[name].effort)",
@@ -392,6 +392,11 @@ def _add_robot(robot: ProjectRobot) -> list[str]:
             "    drive.set_effort_limit(JOINTS[drive.joint().name()].effort)",
         ]
     return lines
+
+
+def _text(value: object) -> str:
+    """Return a text, or a list of texts, as Python writes it; JSON's own escapes of emoji are not Python's."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _pose(X: RigidTransform) -> str:
@@ -410,6 +415,6 @@ def _station_values(station: StationFile) -> dict[str, str]:
         "station_key": f"#{key}" if key else "",
         "home": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.home])},' for arm in station.arms),
         "away": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.away])},' for arm in station.arms),
-        "opening": json.dumps(station.grippers),
+        "opening": _text(station.grippers),
         "period": _number(station.period),
     }
