@@ -179,7 +179,7 @@ def _dataclass_codec(model: Any) -> Codec:
     return Codec(encode, decode)
 
 
-def _encode_part(owner: type, name: str, codec: Codec, value: Any) -> dict[str, np.ndarray]:
+def _encode_part(owner: type, name: str, codec: Codec, value: Any) -> Mapping[str, np.ndarray]:
     try:
         return codec.encode(value)
     except ValueError as error:
