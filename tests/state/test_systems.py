@@ -13,6 +13,13 @@ pytestmark = pytest.mark.one_python
 VECTOR = st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3)
 
 
+@pytest.mark.parametrize("dt", [5e-324, 1.7e-162, 1e-155, 1e-140])
+def test_turn_whose_square_is_zero_is_none(dt):
+    np.testing.assert_allclose(
+        pose_later(np.zeros(6), np.array([0.3, -0.5, 1.0, 0, 0, 0]), dt), np.zeros(6), atol=1e-139
+    )
+
+
 @given(VECTOR, st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3), VECTOR, VECTOR, st.floats(-1.0, 1.0))
 def test_pose_after_constant_velocity_is_that_of_a_rotation_vector(place, angles, turn, speed, dt):
     later = pose_later(np.array([*place, *angles]), np.array([*turn, *speed]), dt)

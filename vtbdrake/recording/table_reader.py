@@ -206,22 +206,22 @@ def _floats(column: Any, unit: str | None) -> Array:
     """
     if isinstance(column, np.ma.MaskedArray):
         return np.where(np.ma.getmaskarray(column), np.nan, _floats(column.data, unit))
-    kept = np.asarray(column)
-    if kept.dtype.kind == "c":
+    entries = np.asarray(column)
+    if entries.dtype.kind == "c":
         raise TypeError("its numbers are complex; give real and imaginary part as two columns")
-    if any(isinstance(entry, date | timedelta) for entry in kept.ravel()[:1]):
+    if any(isinstance(value, date | timedelta) for value in entries.ravel()[:1]):
         raise TypeError("it is of Python's dates or durations; give numbers, or numpy.datetime64 in UTC")
-    if kept.dtype.kind not in "mM":
+    if entries.dtype.kind not in "mM":
         return np.asarray(column, dtype=float)
     if unit is not None:
-        raise TypeError(f"it is of {kept.dtype}, which has its own unit: leave the unit {unit} out")
-    tick, count = np.datetime_data(kept.dtype)
+        raise TypeError(f"it is of {entries.dtype}, which has its own unit: leave the unit {unit} out")
+    tick, count = np.datetime_data(entries.dtype)
     if tick not in _TICKS:
-        raise TypeError(f"it is of {kept.dtype}, whose unit is not known in s")
-    ticks = kept.astype(np.int64) * count
+        raise TypeError(f"it is of {entries.dtype}, whose unit is not known in s")
+    ticks = entries.astype(np.int64) * count
     whole, rest = np.divmod(ticks, round(_TICKS[tick])) if _TICKS[tick] > 1.0 else (0, ticks)
     seconds = whole + rest / _TICKS[tick]  # As its fraction is computed for itself, it is the nearest float.
-    return np.where(np.isnat(kept), np.nan, seconds)
+    return np.where(np.isnat(entries), np.nan, seconds)
 
 
 def _first_text(column: Any) -> str:

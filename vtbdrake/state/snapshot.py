@@ -289,9 +289,9 @@ class StateCopier:
             # others of a plant that are abstract.
             has_ids = from_system is not to_system and is_plant(to_system) and to_system.num_constraints() > 0
             numbers = range(to_context.num_abstract_parameters() if has_ids else 0)
-            kept = [to_context.get_abstract_parameter(number).Clone() for number in numbers]
+            parameters = [to_context.get_abstract_parameter(number).Clone() for number in numbers]
             to_context.SetStateAndParametersFrom(from_system.GetMyContextFromRoot(source))
-            for number, value in zip(numbers, kept, strict=True):
+            for number, value in zip(numbers, parameters, strict=True):
                 to_context.get_mutable_abstract_parameter(number).SetFrom(value)
         for from_variable, to_variable in self._hidden:
             if hidden is not None and to_variable.address not in hidden:

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 POSE_UNIT = "m, rad"
 POSE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")  # names of the entries of `pose_to_array`
+LEAST_TURN = 1e-150
+"""The least angle of a turn that has an axis, in rad."""
+
 # How groups are called in the addresses of systems that name no variables.
 _GROUP_NAMES = {DISCRETE: "discrete_state", PARAMETER: "parameter"}
 # Drake names a system without a name by its class and its address in memory.
@@ -182,7 +185,8 @@ def pose_later(pose: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
     """
     X_WB, turn = pose_from_array(pose), dt * np.asarray(velocity[:3])
     angle = float(np.linalg.norm(turn))
-    R = RotationMatrix(AngleAxis(angle, turn / angle)) if angle else RotationMatrix()
+    # The norm of a smaller one is not exact, and its axis no unit vector.
+    R = RotationMatrix(AngleAxis(angle, turn / angle)) if angle > LEAST_TURN else RotationMatrix()
     return pose_to_array(RigidTransform(R @ X_WB.rotation(), X_WB.translation() + dt * np.asarray(velocity[3:])))
 
 

@@ -88,6 +88,20 @@ def test_imu_that_resumes_goes_on_as_the_one_before(w_WB: list[float]) -> None:
         np.testing.assert_allclose(reading(imu, resumed), reading(imu, running), atol=2e-3)
 
 
+def test_imu_resumes_from_a_turn_whose_square_is_zero() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
+    context = add(builder, plant, imu).CreateDefaultContext()
+    context.SetTime(PERIOD / 2.0)
+    own = imu.GetMyMutableContextFromRoot(context)
+    orientations = []
+    for turn in ([3.4e-162 / PERIOD, 0.0, 0.0], [0.0, 0.0, 0.0]):
+        imu.resume(own, np.array([*turn, 0.0, 0.0, 9.81]))
+        orientations.append(imu.memory.view(own).last_orientation.copy())
+    np.testing.assert_array_equal(*orientations)
+
+
 @pytest.mark.parametrize("k", range(12))
 def test_imu_turns_alike_in_all_orientations(k: int) -> None:
     """Half a turn about axes between two others: of the orientation's quaternion, two entries are large."""

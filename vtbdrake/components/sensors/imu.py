@@ -17,6 +17,7 @@ from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.imu_kernel import sample, specific_force_at_rest
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import Quantity
+from vtbdrake.state.systems import LEAST_TURN
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -138,7 +139,7 @@ class Imu(SampledSensor):
         R_WF = RotationMatrix(Quaternion(memory.last_orientation))
         turn = elapsed * y[:3]
         angle = float(np.linalg.norm(turn))
-        if angle > 0.0:
+        if angle > LEAST_TURN:
             memory.last_orientation = (R_WF @ RotationMatrix(AngleAxis(-angle, turn / angle))).ToQuaternion().wxyz()
             R_WF = R_WF @ RotationMatrix(AngleAxis(-angle / 2.0, turn / angle))
         memory.last_velocity -= elapsed * (R_WF @ y[3:] + self.gravity)
