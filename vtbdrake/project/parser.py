@@ -74,6 +74,9 @@ class ModelParser:
             path: The file.
             packages: The folders of packages by name, which are not searched for.
             folder: Where the copy is written.
+
+        Raises:
+            RobotFileError: Drake would read something else than the files say (see `ModelCopy.fault`).
         """
         self.path = path.resolve()
         self.shown = min(str(self.path), os.path.relpath(self.path), key=len)
