@@ -8,7 +8,7 @@ spanner (GPL-3), which need ``laspy[lazrs]``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -25,7 +25,6 @@ from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import rotation
 from vtbdrake.components.localization.trunks import detect_trunks
 from vtbdrake_diagrams.forest.studies.clouds import PARTIAL, STEM, Cloud, Scanner, rings, virtual_scan
 from vtbdrake_diagrams.forest.studies.recordings import read_r, rioja, stems
@@ -97,8 +96,8 @@ def petawawa(folder: Path) -> tuple[Landmarks, Landmarks]:
     scanned = read_r(folder / "treematching_prf/PRF025_Lidar.rda")["PRF025_Lidar"]
     center = np.array([field["Easting"][0], field["Northing"][0]])
     return (
-        _landmarks(np.column_stack([scanned["X"], scanned["Y"]]) - center, scanned["DBH"], deviation=0.1),
-        _landmarks(np.column_stack([field["Field_X"], field["Field_Y"]]), field["DBH"] / 100.0, deviation=0.3),
+        as_landmarks(np.column_stack([scanned["X"], scanned["Y"]]) - center, scanned["DBH"], deviation=0.1),
+        as_landmarks(np.column_stack([field["Field_X"], field["Field_Y"]]), field["DBH"] / 100.0, deviation=0.3),
     )
 
 
@@ -106,13 +105,14 @@ def airborne(folder: Path) -> tuple[Landmarks, Landmarks]:
     """Return 69 stems measured on the ground, and the map of treetops from the air, without diameters."""
     ground = np.genfromtxt(folder / "treematcher/Ground_Positions.txt", names=True)
     tops = np.genfromtxt(folder / "treematcher/Air_Positions.txt", names=True)
-    mapped = _landmarks(np.column_stack([tops["X"], tops["Y"]]), np.full(len(tops), 0.25), deviation=0.7)
-    local = _landmarks(np.column_stack([ground["X"], ground["Y"]]), ground["STEMDIAM"] / 100.0, deviation=0.2)
+    mapped = as_landmarks(np.column_stack([tops["X"], tops["Y"]]), np.full(len(tops), 0.25), deviation=0.7)
+    local = as_landmarks(np.column_stack([ground["X"], ground["Y"]]), ground["STEMDIAM"] / 100.0, deviation=0.2)
     unknown = np.full(len(mapped), 0.2)
     return local, Landmarks(mapped.positions, mapped.covariances, mapped.diameters, unknown)
 
 
-def _landmarks(places: Array, diameters: Array, *, deviation: float, diameter: float = 0.03) -> Landmarks:
+def as_landmarks(places: Array, diameters: Array, *, deviation: float, diameter: float = 0.03) -> Landmarks:
+    """Return stems at places (n, 2) as landmarks, with standard deviations of places, per axis, and diameters in m."""
     n = len(places)
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), diameters, np.full(n, diameter))
 
@@ -163,7 +163,7 @@ def disagreement(first: Fix, second: Fix) -> tuple[float, float]:
 class Detection:
     """The detector in one virtual scan, against the rings of the cloud.
 
-    What is counted, all but the last five, is beyond the border of the half that the detector's weights are fitted to.
+    What is counted, all but the last six, is beyond the border of the half that the detector's weights are fitted to.
 
     Attributes:
         distances: Distances of the stems that the scan shows, (k,) in m.
@@ -171,6 +171,7 @@ class Detection:
         errors: Position error and error of the diameter of the detections that are right, (l, 2) in m.
         beside: Distances of detections of a stem that are off by more than `_RIGHT`.
         false: Distances of detections where the cloud shows no stem, not even one seen from one side.
+        visible: Which stems the scan shows from edge to edge, (j,).
         stems: Which stems are detected, (m,).
         matched: Which of the trunks these detections are, (m,).
         trunks: The detections, in the frame of the cloud turned by nothing, around the scanner.
@@ -183,11 +184,22 @@ class Detection:
     errors: Array
     beside: Array
     false: Array
+    visible: NDArray[np.intp]
     stems: NDArray[np.intp]
     matched: NDArray[np.intp]
     trunks: Landmarks
     outlined: Landmarks
     eye: Array
+
+    def with_outline(self, outline: float) -> Landmarks:
+        """Return the detections with the covariances of a detector with this outline (m)."""
+        share, trunks, more = (outline / _OUTLINE) ** 2, self.trunks, self.outlined
+        variances = trunks.diameter_deviations**2
+        return replace(
+            trunks,
+            covariances=trunks.covariances + share * (more.covariances - trunks.covariances),
+            diameter_deviations=np.sqrt(variances + share * (more.diameter_deviations**2 - variances)),
+        )
 
 
 def grid(cloud: Cloud, step: float) -> Iterator[Array]:
@@ -231,7 +243,8 @@ def _judged(
     points: Array, eye: Array, trunks: Landmarks, outlined: Landmarks, full: Array, partial: Array, border: float
 ) -> Detection:
     beyond = full[:, 0] > border
-    shown = beyond & np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
+    visible = np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
+    shown = beyond & visible
     places = trunks.positions + eye[:2]
     apart = np.linalg.norm(full[:, None, :2] - places[None], axis=2)
     stem, detection = one_to_one(1.0 - apart)
@@ -250,6 +263,7 @@ def _judged(
         errors=errors[beyond[stem]],
         beside=away[nearest < STEM],
         false=away[nearest >= STEM],
+        visible=np.flatnonzero(visible),
         stems=stem,
         matched=detection,
         trunks=trunks,
@@ -302,9 +316,10 @@ class Errors:
     dvariances: Array
 
     @classmethod
-    def of(cls, full: Array, results: list[Detection], *, half: int) -> Errors:
-        """Return the values of every other stem, in the order of x."""
-        order = full[:, 0].argsort()[half::2]
+    def of(cls, full: Array, results: list[Detection], *, half: int | None = None) -> Errors:
+        """Return the values of every other stem, in the order of x, from the one with the index ``half``; None: all."""
+        order = full[:, 0].argsort()
+        order = order if half is None else order[half::2]
         parts: list[tuple[Array, ...]] = []
         for each in results:
             rows = np.isin(each.stems, order)
@@ -315,6 +330,11 @@ class Errors:
             more = outlined.covariances - P, outlined.diameter_deviations**2 - variances
             parts.append((places, diameters, P, more[0], variances, more[1]))
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    @classmethod
+    def joined(cls, parts: list[Errors]) -> Errors:
+        """Return the values of all parts, one after the other."""
+        return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
 
     def squares(self, outline: float) -> tuple[Array, Array, float]:
         """Return the squared errors by their covariances, of positions and diameters, and -2 ln of the likelihood."""
@@ -342,31 +362,6 @@ def outline_rows(name: str, full: Array, results: list[Detection]) -> Iterator[t
         yield name, f"{outline:.2f}", str(len(judge.diameters)), *cells
 
 
-def chain_row(name: str, full: Array, results: list[Detection]) -> tuple[str, ...]:
-    """Return the row of scans that are located on the rings of their own cloud, turned and moved, without a guess."""
-    X_WC = np.array([100.0, -50.0, 2.0])
-    mapped = _landmarks(full[:, :2], full[:, 2], deviation=0.05).seen_from(X_WC)
-    constellation = ConstellationMap(mapped)
-    sure = wrong = 0
-    errors = []
-    for each in results:
-        fix = constellation.locate(each.trunks)
-        truth = X_WC[:2] + rotation(X_WC[2]) @ each.eye[:2]
-        error = np.hypot(*(fix.pose[:2] - truth))
-        sure += fix.is_sure
-        wrong += fix.is_sure and error > 0.5
-        errors += [error] if fix.is_sure else []
-    shown = [len(each.trunks) for each in results]
-    return (
-        name,
-        str(len(full)),
-        f"{np.median(shown):.0f}",
-        f"{sure} of {len(results)}",
-        str(wrong),
-        f"{np.median(errors):.3f}" if errors else "",
-    )
-
-
 FIELD_HEADER = ("scan", "stems", "pose", "matched", "ln L", "heading, deg", "halves of the map differ by")
 CLOUD_HEADER = (
     "cloud",
@@ -385,7 +380,6 @@ OUTLINE_HEADER = (
     "with it: position",
     "diameter",
 )
-CHAIN_HEADER = ("cloud", "stems on the map", "trunks in a scan", "sure", "wrong", "error, m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,8 +446,7 @@ def main(folder: Path) -> None:
     alone = list(alone_results(folder))
     print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, _, scans in [*results, *alone]]), "\n")
     rows = [row for name, full, scans in results for row in outline_rows(name, full, scans)]
-    print(table(OUTLINE_HEADER, rows), "\n")
-    print(table(CHAIN_HEADER, [chain_row(name, full, scans) for name, full, scans in results]))
+    print(table(OUTLINE_HEADER, rows))
 
 
 if __name__ == "__main__":
