@@ -20,7 +20,7 @@ def test_few_landmarks_are_sure_on_their_own_map_only() -> None:
     own, elsewhere = claimed(local, mapped, place), claimed(local, mirrored(mapped), None)
     assert own == Claim(12, True, True, True)
     assert elsewhere == Claim(12, False, False, False)
-    assert claimed(local, mapped, place + [1.1 * RIGHT, 0.0]) == Claim(12, True, True, False)
+    assert claimed(local, mapped, place + np.array([1.1 * RIGHT, 0.0])) == Claim(12, True, True, False)
     assert row("12", [own, elsewhere, Claim(12, True, True, False)])[1:] == ("1 of 2", "1", "0 of 1")
 
 
