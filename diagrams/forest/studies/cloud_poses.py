@@ -1,7 +1,7 @@
 """From raw clouds to poses: scans that are cut out of real point clouds, located on the stems of their plots, unguided.
 
-``python -m vtbdrake_diagrams.forest.studies.cloud_poses FOLDER`` prints the tables of docs/reality_forest.md. The scans
-and the stems are those of `vtbdrake_diagrams.forest.reality`, turned and moved. Nothing is chosen by what is printed:
+``python -m vtbdrake_diagrams.forest.studies.cloud_poses FOLDER`` prints the tables of docs/reality_forest.md. Scans
+and stems come from `vtbdrake_diagrams.forest.reality`, turned and moved. Nothing is chosen by what is printed:
 
 * The least number of landmarks of a pose, `FEWEST`, is the one of the car in Victoria Park. With so few, no pose is
   wrong in the scans of `vtbdrake_diagrams.forest.studies.few_landmarks`, where no point cloud has part.
@@ -242,7 +242,7 @@ def route(places: Array) -> list[int]:
 
 
 def windows(order: Sequence[int], count: int) -> Iterator[list[int]]:
-    """Yield for each place its route of so many scans that ends there; the first ones are reached from behind."""
+    """Yield for each place the route of ``count`` scans that ends there; the first places are reached from behind."""
     for k in range(len(order)):
         way = order[max(k - count + 1, 0) : k + 1] if k >= count - 1 else order[k : k + count][::-1]
         yield list(way)
@@ -265,8 +265,8 @@ def gathered(chain: Chain, way: Sequence[int], rng: np.random.Generator) -> Land
             pose = compose(pose, measured)
             submap = submap.moved(pose, drift.covariance(measured, float(np.hypot(*motion[:2])) / SPEED))
         # Detections are in the axes of the cloud.
-        seen = chain.trunks(chain.scans[index]).seen_from([0.0, 0.0, -true[k, 2]])
-        submap = submap.with_scan(seen, least_deviation=0.02)
+        trunks = chain.trunks(chain.scans[index]).seen_from([0.0, 0.0, -true[k, 2]])
+        submap = submap.with_scan(trunks, least_deviation=0.02)
     return submap.landmarks()
 
 

@@ -76,12 +76,12 @@ def simulated_claims(seed: int) -> Iterator[Claim]:
     worse = rng.uniform(1.0, 5.0)
     detector = Detector(false=rng.uniform(0.2, 0.4), along=0.03 * worse, across=0.02 * worse, diameter=0.02 * worse)
     wood = Wood.of(stand, false=detector.false, rng=rng)
-    own, foreign = (map_landmarks(each.map(MAPS[name])) for each in (stand, other))
+    whole, foreign = (map_landmarks(each.map(MAPS[name])) for each in (stand, other))
     for _ in range(PER_BATCH):
         pose = np.array([*rng.uniform(0.1 * side, 0.9 * side, 2), rng.uniform(-np.pi, np.pi)])
         local = nearest(wood.detected(pose, detector, rng)[0], rng)
         reach = 0.5 * rng.uniform(*SIDES) if rng.random() < 0.75 else np.inf
-        part, away = (each.select(np.abs(each.positions - pose[:2]).max(axis=1) < reach) for each in (own, foreign))
+        part, away = (each.select(np.abs(each.positions - pose[:2]).max(axis=1) < reach) for each in (whole, foreign))
         if len(part) >= 3:
             yield claimed(local, part, pose[:2])
             yield claimed(local, mirrored(part), None)
@@ -106,14 +106,14 @@ def recorded_claims(
         deviation, diameter = rng.uniform(0.05, 0.2), rng.uniform(0.02, 0.06)
         local = nearest(stems(scans, plot, deviation=deviation, diameter=diameter), rng)
         reach = 0.5 * rng.uniform(*SIDES)
-        own, foreign = (
+        part, away = (
             each.select(np.abs(each.positions).max(axis=1) < reach)
             for each in (stems(inventories, k, deviation=0.1, diameter=0.03) for k in (plot, other))
         )
-        if min(len(own), len(foreign)) >= 3:
-            yield claimed(local, own, places[plot])
-            yield claimed(local, mirrored(own), None)
-            yield claimed(local, mirrored(foreign), None)
+        if min(len(part), len(away)) >= 3:
+            yield claimed(local, part, places[plot])
+            yield claimed(local, mirrored(part), None)
+            yield claimed(local, mirrored(away), None)
 
 
 def scanner_places(tables: tuple[dict[str, Any], dict[str, Any]]) -> dict[int, Array]:

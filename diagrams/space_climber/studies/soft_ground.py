@@ -19,7 +19,7 @@ ground, has the pressure E (1 - s / r) at the distance s from its centre, and so
 With E = k r this is the soil's law for small z; E is chosen so that both agree at the load.
 
 **What a foot feels beside the line, at points.** The centre is at the height h = r - z and at the distance x from the
-line. One part is below it: a force k z upwards. Of the other one, the nearest point is on the line, at the distance
+line. One part is below it: a force k z upwards. The nearest point of the second part is on the line, at the distance
 s = sqrt(x^2 + h^2): a force k (r - s) along (x, h) / s, which pushes the foot away from the line. A rigid foot has
 h = r nearly, and s < r only for x below sqrt(2 r z), some tenths of a millimetre. With boxes, Drake computes just this;
 the depths and normals that it finds between a sphere and a `Convex` are others (drake 1.51).
