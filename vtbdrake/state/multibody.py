@@ -50,7 +50,7 @@ _JOINT_UNITS = {
 _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
 # What is derived from the pose of a body, with its units: the entries of [x, y, z, roll, pitch, yaw].
 POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
-_FRICTION = ("material", "coulomb_friction")
+FRICTION = ("material", "coulomb_friction")  # group and name of the property
 _ROD = ("bodyA", "p_AP", "bodyB", "p_BQ", "distance", "stiffness", "damping")  # of a distance constraint
 
 
@@ -412,7 +412,7 @@ def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix
 
     def with_friction(geometry: GeometryId) -> bool:
         properties = inspector.GetProximityProperties(geometry)
-        return properties is not None and properties.HasProperty(*_FRICTION)
+        return properties is not None and properties.HasProperty(*FRICTION)
 
     world = plant.world_body()
     world_prefix = prefix(plant.GetModelInstanceName(world.model_instance()))
@@ -443,7 +443,7 @@ def _friction(
 
     def read(root: Context) -> np.ndarray:
         inspector = inspect(root)
-        frictions = [inspector.GetProximityProperties(geometry).GetProperty(*_FRICTION) for geometry in geometries]
+        frictions = [inspector.GetProximityProperties(geometry).GetProperty(*FRICTION) for geometry in geometries]
         return np.array([[friction.static_friction(), friction.dynamic_friction()] for friction in frictions])
 
     def refuse(value: np.ndarray) -> None:
@@ -455,7 +455,7 @@ def _friction(
         changed = [ProximityProperties(inspector.GetProximityProperties(geometry)) for geometry in geometries]
         context = scene_graph.GetMyMutableContextFromRoot(root)
         for geometry, properties, coefficients in zip(geometries, changed, value, strict=True):
-            properties.UpdateProperty(*_FRICTION, CoulombFriction(*coefficients))
+            properties.UpdateProperty(*FRICTION, CoulombFriction(*coefficients))
             scene_graph.AssignRole(context, plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
     def write_all(root: Context, value: np.ndarray) -> None:

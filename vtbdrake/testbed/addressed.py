@@ -21,7 +21,7 @@ from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Vari
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
-from vtbdrake.state.systems import is_plant, is_python, leaves, output_ports
+from vtbdrake.state.systems import is_plant, is_python, is_scene_graph, leaves, output_ports
 from vtbdrake.state.variables import X, check_address
 from vtbdrake.testbed.dps_state import DpsReader
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
@@ -30,6 +30,7 @@ from vtbdrake.testbed.slow_part import SlowPart, slow_parts
 from vtbdrake.testbed.switch import BOARD, COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
+    from vtbdrake.state.geometry import GeometryWatch
     from vtbdrake.testbed.scenario_identity import IdentifiedScenario
 
 
@@ -105,6 +106,7 @@ class AddressedDiagram:
         self.interface = interface  # the DPS's signals
         self.simulator_config = simulator_config  # settings of its integration
         self.scenario = scenario  # the scenario that built it, or None
+        self._geometry = _geometry_watch(diagram)
         self._variables = collect(
             diagram,
             plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
@@ -145,6 +147,8 @@ class AddressedDiagram:
         """Return a new context: s0 from defaults."""
         with making():
             context = self.diagram.CreateDefaultContext()
+        if self._geometry is not None:
+            self._geometry.remember(context)
         if self.simulator_config.use_error_control:
             # By the accuracy, Drake finds the times of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
@@ -419,8 +423,18 @@ class AddressedDiagram:
     # -- s(t) as a whole
 
     def snapshot(self, context: Context) -> Snapshot:
-        """Return s(t) as named arrays."""
+        """Return s(t) as named arrays.
+
+        Args:
+            context: A root context of this diagram, or of a diagram that holds it.
+
+        Raises:
+            SnapshotError: Something in it cannot be part of a snapshot: an abstract value that its codec refuses, or
+                geometry that was changed in this context.
+        """
         self.check_context(context)
+        if self._geometry is not None:
+            self._geometry.check(context)
         record = self.scenario.record() if self.scenario is not None else {}
         return snapshots.take(self.diagram, context, self._variables, scenario=record)
 
@@ -501,6 +515,16 @@ def _sampling_part(diagram: Diagram) -> SlowPart | None:
             f"a DPS has at most one slow part that samples its state, not {len(sampling)}: {', '.join(sampling)}"
         )
     return next(iter(sampling.values()), None)
+
+
+def _geometry_watch(diagram: Diagram) -> GeometryWatch | None:
+    """Return a watch over changed geometry; None if there is no SceneGraph, as in most DPS."""
+    if not any(is_scene_graph(system) for _, system in leaves(diagram)):
+        return None
+    # Imported here: heavy, and already imported where there is a SceneGraph.
+    from vtbdrake.state.geometry import GeometryWatch
+
+    return GeometryWatch(diagram)
 
 
 def _port_reader(port: OutputPort, context_of: Callable[[Context], Context]) -> Callable[[Context], Any]:
