@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import shlex
 from functools import cache
 from pathlib import Path
@@ -16,6 +15,7 @@ from vtbdrake.cli.options import grouped, option, schema_option
 from vtbdrake.cli.output import emit, json_option, number, save_recording, say, table, write_whole
 from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.common.failures import one_line
+from vtbdrake.common.file_names import as_file_name
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -175,7 +175,7 @@ def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: P
     from vtbdrake.campaigns.report import Evidence
 
     index = stated.rollout_names.index((rollout.condition, rollout.seed))
-    stem = f"{index}-{re.sub(r'[^A-Za-z0-9_.-]', '_', rollout.condition)}-{rollout.seed}"
+    stem = f"{index}-{as_file_name(rollout.condition)}-{rollout.seed}"
     notes, log, animation = [], "", ""
     if rollout.end and rerun.rollout != rollout:
         notes.append("It did not repeat: alone it has other numbers than in the campaign.")

@@ -5,7 +5,6 @@ pytest imports it in every run where vtbdrake is installed: nothing here imports
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vtbdrake.common.extras import extra_module
 
+from vtbdrake.common.file_names import as_file_name
 if TYPE_CHECKING:
     import pytest
 
@@ -193,7 +193,7 @@ def _folder(item: pytest.Item) -> Path | None:
     mutants = item.config.pluginmanager.get_plugin(_MUTANTS)
     if isinstance(mutants, _Mutants) and mutants.mutant is not None:
         return None
-    return item.config.rootpath / item.config.getoption("vtb_failures") / re.sub(r"[^\w.-]+", "_", item.nodeid)
+    return item.config.rootpath / item.config.getoption("vtb_failures") / as_file_name(item.nodeid)
 
 
 @pytest.hookimpl(wrapper=True)
