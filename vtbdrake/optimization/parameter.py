@@ -68,8 +68,7 @@ class Parameter(_Addressed):
 
     Raises:
         ValueError: The range is empty, reversed, not finite, or too narrow or wide for floating-point numbers, an
-            integer has ends that are not whole, or the lower end
-            of a logarithmic scale is not positive.
+            integer has ends that are not whole, or the lower end of a logarithmic scale is not positive.
     """
 
     address: str

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.common.extras import extra_module
-
 from vtbdrake.common.file_names import as_file_name
 
 if TYPE_CHECKING:
