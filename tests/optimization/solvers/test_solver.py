@@ -68,6 +68,7 @@ EDGES = {
     "one choice": ([Choice("c", [1.0, 0.5])], 1, 0),
     "all kinds": ([Choice("c", [1.0, 0.5]), Parameter("i", 1, 3, integer=True), Parameter("x", -1.0, 2.0)], 1, 0),
     "a range without room": ([Parameter("x", 1.0, np.nextafter(1.0, 2.0)), Parameter("y", 0.0, 1.0)], 1, 0),
+    "one range without room": ([Parameter("x", 1.0, np.nextafter(1.0, 2.0))], 1, 0),
     "two objectives": ([Parameter("x", -1.0, 2.0)], 2, 0),
     "two objectives of integers, constrained": ([Parameter("i", 1, 9, integer=True)], 2, 1),
 }

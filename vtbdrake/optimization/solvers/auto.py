@@ -52,6 +52,8 @@ TRIAL = 2
 HOP = 0.1
 # Local searches in a row that may have nothing better, before the others find something better.
 BASINS = 6
+# Turns in a row in which no method knows a new point: the space has none.
+IDLE = 50
 # Evolution beside the model begins around the best point with this standard deviation.
 EVOLUTION_WIDTH = 0.15
 
@@ -232,13 +234,17 @@ class Auto(Solver):
         self._end(True, f"{PATIENCE} starts in a row found nothing better")
 
     def _turns(self) -> Iterator[_Arm]:
-        """Yield the method of each batch, once a minimum is located: the one that is due by its account."""
+        """Yield the method of each batch, once a minimum is located: the one that is due by its account.
+
+        It ends where no method has a new point, as in a range of a few floating-point numbers.
+        """
         # Side by side in the first case, one after the other in the second.
         beside = self._has_local and self.search.size <= PROCESS_SIZE
         model = self._new_model() if not self._has_local or beside else None
         evolutions = self._evolutions()
         evolution: _Arm | None = None
-        while True:
+        idle = 0
+        while idle < IDLE:
             if evolution is None and (beside or model is None):
                 evolution = next(evolutions, None)
                 if evolution is None and model is None:
@@ -251,6 +257,7 @@ class Auto(Solver):
             assert arm is not None
             count, before = self._count, self._best
             yield arm
+            idle = 0 if self._count > count else idle + 1
             progress = self._progress(before, self._best)
             self._accounts[kind].charge(self._count - count, progress, TRIAL * (self.search.size + 2))
             if progress:
