@@ -220,15 +220,21 @@ def test_processes_of_a_child_can_be_terminated() -> None:
     assert child.close() == 0
 
 
-def test_ending_signals_are_handled_in_the_block_only() -> None:
+@pytest.mark.parametrize("ignored", [set(), {signal.SIGHUP}])
+def test_ending_signals_are_handled_in_the_block_only_unless_they_are_ignored(ignored: set[signal.Signals]) -> None:
     numbers = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-    before = [signal.getsignal(number) for number in numbers]
-    received: list[int] = []
-    with ending_signals(lambda number, _: received.append(number)):
-        for number in numbers:
-            signal.raise_signal(number)
-    assert received == [*numbers]
-    assert [signal.getsignal(number) for number in numbers] == before
+    shell = {n: signal.signal(n, signal.SIG_IGN if n in ignored else signal.default_int_handler) for n in numbers}
+    try:
+        before = [signal.getsignal(number) for number in numbers]
+        received: list[int] = []
+        with ending_signals(lambda number, _: received.append(number)):
+            for number in numbers:
+                signal.raise_signal(number)
+        assert received == [number for number in numbers if number not in ignored]
+        assert [signal.getsignal(number) for number in numbers] == before
+    finally:
+        for number, handler in shell.items():
+            signal.signal(number, handler)
 
 
 def test_child_that_computes_in_c_ends_with_its_connection():
