@@ -271,6 +271,9 @@ def test_damaged_set_is_refused(tmp_path: Path) -> None:
     (write("empty") / "meta/info.json").write_text('{"codebase_version": "v3.0"}')
     with pytest.raises(LogError, match="does not describe a data set of LeRobot"):
         read("empty")
+    (tmp_path / "empty/meta/info.json").write_text("[]")
+    with pytest.raises(LogError, match="is no data set of LeRobot: meta/info.json holds no object"):
+        read("empty")
     (tmp_path / "folder").mkdir()
     with pytest.raises(LogError, match=r"nor a data set of LeRobot, which has a meta/info.json"):
         read("folder")

@@ -143,3 +143,45 @@ def test_damaged_recording_gives_one_sentence(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(LogError, match=r"run.mcap is damaged: \w+, [^\n]+$"):
         read_table(path, sense={"a": "/pose.a"}, time="log_time")
+
+
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        ([{"a": [1]}, {"a": [1, 2]}], r"the arrays of /pose.a have several shapes, \(1,\), \(2,\): take /pose.a\[0\]"),
+        ([{"a": {"x": 1, "y": 2}}], r"/pose.a is not of numbers: it has /pose.a.x, /pose.a.y$"),
+        ([{"a": "2026-01-01T00:00:00Z"}], "/pose.a is not of numbers: the first value is '2026-01-01T00:00:00Z'"),
+        ([{"a": []}], r"/pose.a is not of numbers: the first value is \[\]"),
+        ([[1, 2]], "has no column '/pose.a'.*; it has: /other.log_time, /pose.log_time$"),
+    ],
+)
+def test_field_that_is_no_column_is_described(tmp_path: Path, messages: list[Any], message: str) -> None:
+    path = write_json(tmp_path / "run.mcap", messages)
+    with pytest.raises(LogError, match=message):
+        read_table(path, sense={"a": "/pose.a"}, time="log_time")
+
+
+def test_empty_array_is_no_sample(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [{"a": []}, {"a": [1, 2]}, {"a": [3, 4]}])
+    assert read_table(path, sense={"a": "/pose.a"}, time="log_time").sense["a"].values.tolist() == [[1, 2], [3, 4]]
+
+
+def test_time_stamps_of_texts_are_numbers(tmp_path: Path) -> None:
+    path = write_json(
+        tmp_path / "run.mcap", [{"a": k, "at": {"sec": str(k), "nanosec": 500_000_000}} for k in range(3)]
+    )
+    assert read_table(path, sense={"a": "/pose.a"}, time="at").sense["a"].times.tolist() == [0.5, 1.5, 2.5]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "kind"), [("protobuf", b"zz", "protobuf"), ("cdr", b"float64 q q\n\0", "ros2msg")]
+)
+def test_definitions_that_cannot_be_read_are_told(tmp_path: Path, encoding: str, schema: bytes, kind: str) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/j", encoding, writer.register_schema("pkg/msg/S", kind, schema))
+        writer.add_message(channel, 0, b"zz", 0)
+        writer.finish()
+    with pytest.raises(LogError, match=r"a.mcap: the definitions of the messages of /j cannot be read: \w+Error, "):
+        read_table(tmp_path / "a.mcap", sense={"q": "/j.q"}, time="log_time")

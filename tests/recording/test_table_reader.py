@@ -183,6 +183,13 @@ def test_parquet_with_time_stamps_is_in_seconds(tmp_path: Path) -> None:
     assert times.tolist() == [1767225600.0, 1767225600.01, 1767225600.02, 1767225600.03]
 
 
+def test_column_of_parquet_that_numpy_lacks_is_told(tmp_path: Path) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(arrow.table({"time": arrow.array([0, 1], arrow.time64("ns"))}), tmp_path / "a.parquet")
+    with pytest.raises(LogError, match="a.parquet: the column time cannot be read: "):
+        read_table(tmp_path / "a.parquet", sense={"q": "time"})
+
+
 def test_masked_entry_is_no_sample() -> None:
     column = np.ma.masked_array([1, 2, 3, 4], mask=[False, True, False, False])
     series = read_table({"time": TIMES, "q": column}, sense={"q": "q"}).sense["q"]
@@ -199,6 +206,8 @@ def test_masked_entry_is_no_sample() -> None:
         ("a.csv", "time,q,q\n0,1,2\n", "two columns 'q'"),
         ("a.csv", "time,q\n0,1\n1\n2,3\n", "row 1 has 1 columns, not 2"),
         ("a.npz", "no archive", "not an .npz of arrays"),
+        ("a.parquet", "", "a.parquet is no Parquet file that can be read: "),
+        ("a.parquet", "PAR1junkPAR1", "a.parquet is no Parquet file that can be read: "),
     ],
 )
 def test_bad_file_is_refused(tmp_path: Path, name: str, content: str, message: str) -> None:

@@ -62,6 +62,8 @@ class LeRobotTable(Mapping[str, Any]):
             content: dict[str, Any] = json.loads((self._path / name).read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise LogError(f"{self._path} is no data set of LeRobot: {name} cannot be read: {error}") from error
+        if not isinstance(content, dict):
+            raise LogError(f"{self._path} is no data set of LeRobot: {name} holds no object")
         return content
 
     def _check_files(self, total: int) -> None:

@@ -73,12 +73,26 @@ class MessageTable(ABC, Mapping[str, Any]):
         path = column[len(topic) + 1 :]
         if path == LOG_TIME:
             return 1e-9 * np.array([time for time, _ in messages], dtype=float)
-        values = [_number(_field(message, path)) for _, message in messages]
-        shape = next((np.shape(value) for value in values if value is not None), None)
-        if shape is None:
-            raise KeyError(column)
-        blank = np.full(shape, np.nan)
+        numbers = (_number(_field(message, path)) for _, message in messages)
+        # An array that is empty is unknown, as in the joint states of ROS.
+        values = [None if value is None or not np.size(value) else value for value in numbers]
+        shapes = list(dict.fromkeys(np.shape(value) for value in values if value is not None))
+        if not shapes:
+            raise self._no_numbers(column, [_field(message, path) for _, message in messages])
+        if len(shapes) > 1:
+            shown = ", ".join(map(str, shapes[:3])) + (", ..." if len(shapes) > 3 else "")
+            raise LogError(f"{self.path}: the arrays of {column} have several shapes, {shown}: take {column}[0], say")
+        blank = np.full(shapes[0], np.nan)
         return np.array([blank if value is None else value for value in values])
+
+    def _no_numbers(self, column: str, values: list[Any]) -> Exception:
+        """Return the error for a field without a number in any message: a KeyError if no message has it."""
+        value = next((value for value in values if value is not None), None)
+        if value is None:
+            return KeyError(column)
+        names = "" if isinstance(value, str | bytes) else ", ".join(f"{column}.{name}" for name in _names(value))
+        described = f"it has {names}" if names else f"the first value is {value!r:.60}"
+        return LogError(f"{self.path}: {column} is not of numbers: {described}")
 
     def __contains__(self, column: object) -> bool:
         with suppress(KeyError):
@@ -101,7 +115,7 @@ def _names(message: Any) -> list[str]:
         return [*message]
     if hasattr(message, "DESCRIPTOR"):
         return [field.name for field in message.DESCRIPTOR.fields]
-    return [name for name in vars(message) if not name.startswith("_")]
+    return [name for name in getattr(message, "__dict__", {}) if not name.startswith("_")]
 
 
 def _field(message: Any, path: str) -> Any:
@@ -125,8 +139,8 @@ def _number(value: Any) -> Any:
         return None
     for seconds, nanoseconds in _SECONDS:
         parts = _field(value, seconds), _field(value, nanoseconds)
-        if None not in parts:
-            return parts[0] + 1e-9 * parts[1]
+        with suppress(TypeError, ValueError):  # JSON may have whole numbers as texts.
+            return float(parts[0]) + 1e-9 * float(parts[1])
     if isinstance(value, Mapping) or hasattr(value, "DESCRIPTOR") or not hasattr(value, "__iter__"):
         return None
     with suppress(TypeError, ValueError):
@@ -182,13 +196,22 @@ class McapTable(MessageTable):
         messages: Messages = []
         for schema, channel, message in self._raw([topic]):
             if channel.id not in decoders:
-                decoders[channel.id] = self._decoder(schema, channel)
+                decoders[channel.id] = self._safe_decoder(schema, channel)
             try:
                 messages.append((message.log_time, decoders[channel.id](message.data)))
             except Exception as error:  # as in `_read`
                 text = f"{self.path}: a message of {topic} at {1e-9 * message.log_time:g} s cannot be read"
-                raise LogError(f"{text}: {one_line(error)}") from error
+                raise LogError(f"{text}: {type(error).__name__}, {one_line(error)}") from error
         return sorted(messages, key=lambda each: each[0])
+
+    def _safe_decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:
+        try:
+            return self._decoder(schema, channel)
+        except (LogError, ModuleNotFoundError):
+            raise
+        except Exception as error:  # as in `_read`
+            text = f"{self.path}: the definitions of the messages of {channel.topic} cannot be read"
+            raise LogError(f"{text}: {type(error).__name__}, {one_line(error)}") from error
 
     def _decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:
         encoding = channel.message_encoding
@@ -232,7 +255,11 @@ class BagTable(MessageTable):
     def _messages(self, topic: str) -> Messages:
         with self._reader() as reader:
             connections = [connection for connection in reader.connections if connection.topic == topic]
-            return [
-                (time, reader.deserialize(data, connection.msgtype))
-                for connection, time, data in reader.messages(connections)
-            ]
+            messages: Messages = []
+            try:
+                for connection, time, data in reader.messages(connections):
+                    messages.append((time, reader.deserialize(data, connection.msgtype)))
+            except Exception as error:  # The reader raises whatever the file makes it raise.
+                text = f"{self.path}: message {len(messages)} of {topic} cannot be read"
+                raise LogError(f"{text}: {type(error).__name__}, {one_line(error)}") from error
+            return messages

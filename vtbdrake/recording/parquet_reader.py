@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.common.extras import extra_module
+from vtbdrake.common.failures import one_line
 from vtbdrake.recording.log_format import LogError
 
 
@@ -18,11 +19,18 @@ class ParquetTable(Mapping[str, Any]):
 
     Args:
         path: The file.
+
+    Raises:
+        LogError: It cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording").ParquetFile(path)
+        parquet = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording")
+        try:
+            self._file = parquet.ParquetFile(path)
+        except (ValueError, NotImplementedError) as error:  # Arrow's errors are subclasses of them.
+            raise LogError(f"{path} is no Parquet file that can be read: {one_line(error)}") from error
 
     @property
     def rows(self) -> int:
@@ -32,6 +40,14 @@ class ParquetTable(Mapping[str, Any]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self:
             raise KeyError(name)
+        try:
+            return self._column(name)
+        except (ValueError, NotImplementedError) as error:
+            if isinstance(error, LogError):
+                raise
+            raise LogError(f"{self._path}: the column {name} cannot be read: {one_line(error)}") from error
+
+    def _column(self, name: str) -> NDArray[Any]:
         column: Any = self._file.read(columns=[name])[name]
         if not str(column.type).startswith(("list", "fixed_size_list", "large_list")):
             return np.asarray(column.to_numpy())
