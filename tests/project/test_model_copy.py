@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from vtbdrake.project import RobotFileError, add_model, read_robot, write_project
@@ -188,6 +189,18 @@ def test_what_drake_refuses_is_mended_with_a_note(tmp_path: Path, arm: str, furt
     assert any(text.partition("robot.urdf")[1:] and note in text for text in robot.notes)
 
 
+@pytest.mark.parametrize("axis", ["0, 0.6, 0.8", "0.,.6,.8", "0.0, .6, 8e-1", "0, 6, 8", "0,6,8"])
+def test_commas_between_numbers_are_blanks(tmp_path: Path, axis: str) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace('axis xyz="0 1 0"', f'axis xyz="{axis}"'))
+    robot = read_robot(path)
+    assert any("robot.urdf:4: commas between numbers count as blanks" in note for note in robot.notes)
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(bytes(robot.files[robot.model]).decode(), "urdf")
+    plant.Finalize()
+    assert plant.GetJointByName("hinge").revolute_axis() == pytest.approx([0.0, 0.6, 0.8])
+
+
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
@@ -250,6 +263,12 @@ def test_commas_that_are_no_numbers_are_left_alone() -> None:
         '<robot name="1,2"><link name="3,4"/><gazebo><update>1,5</update></gazebo><a note="1, 2 or so">x, y</a></robot>'
     )
     assert not list(faults(XmlText(text.encode()).root))
+
+
+def test_names_of_numbers_keep_their_commas(tmp_path: Path) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace('"hinge"', '"1, 2"'))
+    assert [joint.name for joint in read_robot(path).joints] == ["1, 2"]
 
 
 def test_names_with_emoji_are_python(tmp_path: Path) -> None:

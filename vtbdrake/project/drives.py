@@ -78,12 +78,12 @@ def falling_base(parser: ModelParser, plant: MultibodyPlant, joints: list[Joint]
     falls = any(j.type_name() == PRISMATIC and abs(weights[int(j.velocity_start())]) > _FALLS for j in base)
     if not (drives and falls):
         return ()
-    held = tuple(joint.name() for joint in base)
+    base_joints = tuple(joint.name() for joint in base)
     parser.notes.append(
-        f"{parser.place(held[0])}: no actuator carries {', '.join(held)} of the base, which would fall: they are held "
-        "at home (hold_joint in robot.py)"
+        f"{parser.place(base_joints[0])}: no actuator carries {', '.join(base_joints)} of the base, which would fall: "
+        "they are held at home (hold_joint in robot.py)"
     )
-    return held
+    return base_joints
 
 
 def choose_drives(parser: ModelParser, plant: MultibodyPlant, joints: list[Joint], robot: ProjectRobot) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vtbdrake.project.meshes import CONVERTED, MeshError, can_convert, convert
-from vtbdrake.project.model_faults import faults
+from vtbdrake.project.model_faults import elements_read, faults, values
 from vtbdrake.project.xml_text import XmlElement, XmlText
 
 _MODEL_SUFFIXES = "urdf|sdf|xml|obj|mtl|stl|dae|ply|gltf|glb|bin|vtk|png|jpe?g|ktx2|tga|bmp"
@@ -34,6 +34,8 @@ _DENSITY = 1000.0
 # What a body without mass gets, in kg and kg m^2.
 _NO_MASS = 1e-9
 _NO_INERTIA = 1e-12
+# A number, as Drake reads it.
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 # How many faults an error names.
 _SHOWN = 3
 
@@ -100,6 +102,8 @@ class _Copier:
         self._assumed: list[tuple[str, str, str]] = []  # place, link, moment of inertia
 
     def copy(self) -> ModelCopy:
+        for source, xml in self._texts.items():
+            self._separate_numbers(source, xml)
         every = [(source, *fault) for source, xml in self._texts.items() for fault in faults(xml.root)]
         fault = "; ".join(f"{self._place(source, element)}: {text}" for source, element, text in every[:_SHOWN])
         for source, xml in self._texts.items():
@@ -162,6 +166,22 @@ class _Copier:
             self._assume_inertia(source, xml)
         else:
             self._give_mass(source, xml)
+
+    def _separate_numbers(self, source: Path, xml: XmlText) -> None:
+        """Put blanks for commas between numbers, which Drake takes for no numbers."""
+        separated = []
+        for element in elements_read(xml.root):
+            changed = {name: new for name, text in values(element).items() if (new := _with_blanks(text)) != text}
+            if not changed:
+                continue
+            separated.append(element)
+            if changed.keys() & element.attributes.keys():
+                xml.set(element, **{name: text for name, text in changed.items() if name in element.attributes})
+            else:
+                xml.set_text(element, changed[element.tag])
+        if separated:
+            more = f", and so in {len(separated) - 1} more elements" if len(separated) > 1 else ""
+            self._note(source, separated[0], f"commas between numbers count as blanks{more}")
 
     def _name_model(self, xml: XmlText) -> None:
         attribute = {URDF: "name", MJCF: "model"}.get(xml.root.tag)
@@ -348,6 +368,23 @@ def _refer(xml: XmlText, mesh: XmlElement, reference: str) -> None:
     else:
         # In MJCF, a mesh is named like its file.
         xml.set(mesh, name=mesh.get("name") or Path(mesh.get("file")).stem, file=reference)
+
+
+def _with_blanks(text: str) -> str:
+    """Return a vector whose numbers are separated by commas with blanks instead; anything else as it is.
+
+    Commas separate numbers where blanks follow each one, where the numbers have points, or where there are several
+    commas and no blanks; otherwise they may be decimal ones.
+    """
+    if not re.fullmatch(rf"\s*{_NUMBER}(?:\s*,\s*{_NUMBER})+\s*,?\s*", text):
+        return text
+    numbers = text.replace(",", " ").split()
+    is_separator = (
+        len(re.findall(r",\s", text)) == len(numbers) - 1
+        or any("." in number for number in numbers)
+        or (text.count(",") > 1 and len(text.split()) == 1)
+    )
+    return " ".join(numbers) if is_separator else text
 
 
 def _is_zero(text: str) -> bool:

@@ -23,17 +23,24 @@ def faults(root: XmlElement) -> Iterator[tuple[XmlElement, str]]:
     Args:
         root: The root of the file.
     """
-    for element in _read(root):
+    for element in elements_read(root):
         yield from ((element, fault) for check in _CHECKS for fault in check(element))
     if root.tag == "robot":
         yield from _twice(root)
 
 
-def _read(element: XmlElement) -> Iterator[XmlElement]:
+def elements_read(element: XmlElement) -> Iterator[XmlElement]:
+    """Yield an element and all below it, but for those that Drake does not read."""
     if element.tag not in _NOT_READ:
         yield element
         for child in element.children:
-            yield from _read(child)
+            yield from elements_read(child)
+
+
+def values(element: XmlElement) -> dict[str, str]:
+    """Return the attributes of an element that are no names, and its text by its tag, where it has no children."""
+    texts = {**element.attributes, **({} if element.children else {element.tag: element.text})}
+    return {name: text for name, text in texts.items() if name not in _NAMES}
 
 
 def _is_xacro(element: XmlElement) -> Iterator[str]:
@@ -44,10 +51,9 @@ def _is_xacro(element: XmlElement) -> Iterator[str]:
 
 
 def _has_commas(element: XmlElement) -> Iterator[str]:
-    texts = {**element.attributes, **({} if element.children else {element.tag: element.text})}
-    for name, text in texts.items():
+    for name, text in values(element).items():
         numbers = text.split()
-        if name not in _NAMES and "," in text and all(map(_NUMBER.fullmatch, numbers)):
+        if "," in text and all(map(_NUMBER.fullmatch, numbers)):
             yield (
                 f"the {name} {text.strip()!r} has a comma, at which Drake stops to read: write decimal points, and "
                 "blanks between numbers"

@@ -102,7 +102,7 @@ class ModelParser:
         with self._noting_warnings():
             try:
                 parse(plant, self._written, self._folders)
-            except (RuntimeError, SystemExit) as error:
+            except (RuntimeError, ValueError, SystemExit) as error:
                 raise self._error(one_line(error)) from error
 
     def finalize(self, plant: MultibodyPlant) -> None:

@@ -1,7 +1,7 @@
 """Application R1: does it pay to try each heading also in draws of the ground that the robot does not know well?
 
 The walks of ``perceived.jsonl`` tried headings in the believed world alone. Here the same robot walks again in the same
-craters, and tries each heading in draws of the ground, too, of which the worst counts.
+craters, and tries each heading in draws of the ground, too. The worst rollout counts.
 
 ``python -m vtbdrake_diagrams.space_climber.studies.drawn_terrain`` does so, and compares.
 """
@@ -49,14 +49,14 @@ def comparison(without: Sequence[Walk], drawn: Sequence[Walk]) -> str:
 @click.option("--draws", default=2, show_default=True, help="Number of draws of the ground.")
 def main(first: int, count: int, draws: int) -> None:
     """Let the robot walk with draws where it has walked without."""
-    kept = {each.seed: each.walks["reasoned"] for each in judged(load()) if first <= each.seed < first + count}
+    without = {each.seed: each.walks["reasoned"] for each in judged(load()) if first <= each.seed < first + count}
     drawn = []
-    for seed in kept:
+    for seed in without:
         drawn.append(Site(seed).explore(draws=draws))
         click.echo(
             f"crater {seed}: {'the rim' if drawn[-1].reached else drawn[-1].reason} in {drawn[-1].duration:.0f} s"
         )
-    click.echo(comparison(list(kept.values()), drawn))
+    click.echo(comparison(list(without.values()), drawn))
 
 
 if __name__ == "__main__":

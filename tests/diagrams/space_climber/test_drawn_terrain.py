@@ -1,4 +1,4 @@
-"""What draws of the ground change is told of the same craters."""
+"""Walks with and without draws of the ground are compared crater by crater."""
 
 from dataclasses import replace
 
