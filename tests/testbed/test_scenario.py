@@ -15,6 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError, Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
+from vtbdrake.testbed.scenario_file import compose_yaml
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,6 +51,9 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
         (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator_config, pedigree, period, time_step"),
         (f"{NAME}:\n  simulator_config: &a\n    <<: {{acuracy: 0.1}}\n", "'simulator_config.acuracy'"),
         (f"{NAME}:\n  period: 0.1\n  period: 0.2\n", "the key 'period' twice"),
+        (f"{NAME}:\n  period: 010\n", "s.yaml: line 2: 010 is a number to the base 8 in YAML: write it to the base 10"),
+        (f"{NAME}:\n  time_step: 0.1\n  period: 1:30\n", "line 3: 1:30 is a number to the base 60 in YAML"),
+        (f"{NAME}:\n  period: -1:30.5\n", "line 2: -1:30.5 is a number to the base 60 in YAML"),
         (f"{NAME}:\n  period: fast\n", "fast"),
         (f"{NAME}:\n  period: .nan\n", "period must be a finite number, not nan"),
         (f"{NAME}:\n  simulator_config:\n    integration_scheme: magic\n", "is one of bogacki_shampine3, cenic"),
@@ -69,6 +73,13 @@ def test_a_bad_file_is_refused(tmp_path, text, message):
     (tmp_path / "s.yaml").write_text(text)
     with pytest.raises(ScenarioError, match=message):
         load_scenario(tmp_path / "s.yaml")
+
+
+@pytest.mark.parametrize("number", ["0", "0.0", "00.5", "10", "0e1", "'010'", "0x10"])
+def test_numbers_that_mean_what_they_look_like_are_read(tmp_path, number):
+    (tmp_path / "s.yaml").write_text(f"{NAME}:\n  period: {number}\n")
+    node = compose_yaml(tmp_path / "s.yaml")
+    assert node.value[0][1].value[0][1].value == number.strip("'")
 
 
 def test_the_user_may_name_the_class_of_a_file(tmp_path):

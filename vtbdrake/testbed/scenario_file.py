@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -191,6 +192,13 @@ def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> S
     return scenario
 
 
+_NUMBER_TAGS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+"""What YAML takes for numbers."""
+
+_ANOTHER_BASE = re.compile(r"[-+]?(?:(?P<octal>0[0-9_]+$)|[0-9][0-9_]*(?::[0-5]?[0-9])+)")
+"""Numbers of YAML 1.1 that mean something else than they look like: 010 is 8, and 1:30 is 90."""
+
+
 def compose_yaml(
     path: Path, *, kind: str = "scenario", loader: type[yaml.SafeLoader] = yaml.SafeLoader
 ) -> yaml.Node | None:
@@ -328,6 +336,16 @@ def _check_nodes(document: yaml.Node | None, path: Path) -> None:
             waiting += [value for _, value in node.value]
         elif isinstance(node, yaml.SequenceNode):
             waiting += node.value
+        elif (
+            isinstance(node, yaml.ScalarNode)
+            and node.tag in _NUMBER_TAGS
+            and (number := _ANOTHER_BASE.match(node.value))
+        ):
+            base = "8" if number["octal"] else "60"
+            raise ScenarioError(
+                f"{path}: line {node.start_mark.line + 1}: {node.value} is a number to the base {base} in YAML: write "
+                "it to the base 10, or in quotes if it is a text"
+            )
 
 
 def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
