@@ -449,6 +449,7 @@ def _regret(title: str, names: Sequence[str], budgets: Sequence[int], seeds: Seq
     solvers = {name: [AUTO, *(r for r in rivals[name] if name in HELD_OUT or r not in NUMBERS)] for name in names}
     tasks = [(name, solver, seed) for name, of_case in solvers.items() for solver in of_case for seed in seeds]
     rows, own_times = [], []
+    medians_by_budget: dict[int, list[dict[str, float]]] = {budget: [] for budget in budgets}
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         outcomes = pool.map(partial(gaps, budgets=budgets), tasks)
         for name, of_case in solvers.items():
@@ -461,10 +462,12 @@ def _regret(title: str, names: Sequence[str], budgets: Sequence[int], seeds: Seq
                 own_times += [own for _, own in found if solver == AUTO]
             for i, budget in enumerate(budgets):
                 medians = {solver: float(np.median(of_solver[:, i])) for solver, of_solver in by_solver.items()}
+                medians_by_budget[budget].append(medians)
                 rows.append(_row(f"{title}_{name}_{budget}", medians))
                 # The whole takes minutes.
                 print(f"{rows[-1].name}: {rows[-1].value:.3g} of {rows[-1].against}; {rows[-1].note}", flush=True)
-    return [_summary(title, rows, max(own_times)), *rows]
+    shares = [_share(f"{title}_{budget}", medians) for budget, medians in medians_by_budget.items()]
+    return [_summary(title, rows, max(own_times)), *shares, *rows]
 
 
 def _summary(title: str, rows: Sequence[Benchmark], own: float) -> Benchmark:
@@ -484,6 +487,30 @@ def _summary(title: str, rows: Sequence[Benchmark], own: float) -> Benchmark:
         note=f"the share of {len(ratios)} rows whose ratio of gaps is at most {GOOD}; the median is "
         f"{np.median(ratios):.2g}, the largest {largest.value:.2g} in {largest.name}; auto is the last in "
         f"{', '.join(last) or 'none'}, and takes {1e3 * own:.2g} ms per point at most, the cost included",
+    )
+
+
+def _share(name: str, rows: Sequence[Mapping[str, float]]) -> Benchmark:
+    """Return the share of good rows of `auto`, beside the shares of the others: whether anyone reaches the goal.
+
+    A solver is good in a row by the same rule as `auto`: its gap is at most `GOOD` times the best gap of the others.
+    """
+    good: dict[str, list[bool]] = {}
+    for medians in rows:
+        for solver in medians:
+            least = max(min(gap for rival, gap in medians.items() if rival not in (solver, AUTO)), SOLVED)
+            good.setdefault(solver, []).append(medians[solver] <= GOOD * least)
+    ours = good.pop(AUTO)
+    best = max(good, key=lambda solver: sum(good[solver]))
+    counts = ", ".join(f"{solver} in {sum(held)} of {len(held)}" for solver, held in good.items())
+    return Benchmark(
+        name=name,
+        value=sum(ours) / len(ours),
+        unit="1",
+        goal=None,
+        better=HIGHER,
+        against=f"the best single solver, {best}: {sum(good[best]) / len(good[best]):.2g}",
+        note=f"auto is good in {sum(ours)} of {len(ours)} rows; by the same rule {counts}",
     )
 
 

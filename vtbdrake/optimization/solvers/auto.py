@@ -36,8 +36,8 @@ MODEL_LIMIT = 120
 MODEL_BATCHES = 4
 # Closest points that the Gaussian process learns from the other methods, as a part of the ranges.
 MODEL_SPACING = 0.005
-# The radius with which the first local search begins, as a part of the ranges.
-FIRST_RADIUS = 0.35
+# The radius with which the first local search begins, as a part of the ranges: from their middle it tries the quarters.
+FIRST_RADIUS = 0.25
 # The radius of the later ones.
 LOCAL_RADIUS = 0.1
 # A local search has located its minimum when its best point moves by less than this part of the ranges.
