@@ -65,6 +65,7 @@ BENCHMARKS: Registry = {
     "study_against_optuna": "benchmarks.study:study_against_optuna",
     "auto_regret": "benchmarks.auto_regret:auto_regret",
     "auto_regret_full": "benchmarks.auto_regret:auto_regret_full",
+    "auto_regret_tuning": "benchmarks.auto_regret:auto_regret_tuning",
     "auto_regret_mixed": "benchmarks.auto_regret:auto_regret_mixed",
     "racing_savings": "benchmarks.study:racing_savings",
     "study_page_open": "benchmarks.study_page:study_page_open",
@@ -94,7 +95,7 @@ BENCHMARKS: Registry = {
 }
 
 # They take minutes each, or need a wheel; without names, the others run.
-ONLY_BY_NAME = ("calibration_time", "auto_regret_full", "time_to_target_full", "bare_to_browser")
+ONLY_BY_NAME = ("calibration_time", "auto_regret_full", "auto_regret_tuning", "time_to_target_full", "bare_to_browser")
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
 

@@ -182,6 +182,12 @@ def _gallagher(u: np.ndarray) -> float:
     return 10.0 - np.max(heights * np.exp(-0.5 / u.size * np.sum(widths * (u - centres) ** 2, axis=1)))
 
 
+def _styblinski_tang(x: np.ndarray) -> float:
+    """Two minima along each axis; the deepest is at 0."""
+    z = x - 2.903534027771178
+    return np.sum(z**4 - 16.0 * z**2 + 5.0 * z) + 78.33233140754282 * x.size
+
+
 def _gramacy_lee(x: np.ndarray) -> float:
     return np.sin(10.0 * np.pi * x[0]) / (2.0 * x[0]) + (x[0] - 1.0) ** 4
 
@@ -215,6 +221,11 @@ def _steps(x: np.ndarray) -> float:
 def _sharp(x: np.ndarray) -> float:
     """The sharp ridge: along it the cost falls slowly, beside it, it rises at once."""
     return x[0] ** 2 + 100.0 * math.sqrt(x[1:] @ x[1:])
+
+
+def _absolute(x: np.ndarray) -> float:
+    """Weighed absolute values, with a crease along each axis."""
+    return np.abs(x) @ 10.0 ** (np.arange(x.size) / max(x.size - 1, 1))
 
 
 def _cart(u: np.ndarray) -> float:
@@ -294,6 +305,35 @@ TUNING: dict[str, Function] = {
     "steps_5": Function(ROUGH, 5, _shifted(_steps, 5, 10.0, seed=20)),
     "sharp_6": Function(ROUGH, 6, _shifted(_sharp, 6, 4.0, seed=21)),
     "cart_8": Function(ROUGH, 8, _cart),
+}
+
+# More functions at several sizes and places: the kind, the function, its width, and pairs of size and seed.
+_FAMILIES: dict[str, tuple[str, Callable[[np.ndarray], float], float, tuple[tuple[int, int], ...]]] = {
+    "ellipsoid": (SMOOTH, _ellipsoid(1e3), 7.0, ((2, 201), (4, 202), (8, 203), (14, 204))),
+    "turned_rosenbrock": (SMOOTH, lambda x: _rosenbrock(x + 1.0), 3.5, ((3, 205), (6, 206), (12, 207))),
+    "zakharov": (SMOOTH, _zakharov, 9.0, ((2, 208), (4, 209), (9, 210))),
+    "powell": (SMOOTH, _powell, 7.0, ((12, 211), (4, 212))),
+    "cone": (SMOOTH, lambda x: math.sqrt(1.0 + x @ x) - 1.0, 6.0, ((5, 213), (18, 214))),
+    "rastrigin": (MULTIMODAL, _rastrigin, 7.0, ((2, 215), (5, 216), (12, 217))),
+    "ackley": (MULTIMODAL, _ackley, 35.0, ((1, 218), (4, 219), (7, 220))),
+    "griewank": (MULTIMODAL, _griewank, 150.0, ((2, 221), (7, 222), (14, 223))),
+    "levy": (MULTIMODAL, _levy, 14.0, ((3, 224), (8, 225))),
+    "styblinski_tang": (MULTIMODAL, _styblinski_tang, 9.0, ((2, 226), (3, 227), (7, 228))),
+    "steps": (ROUGH, _steps, 9.0, ((2, 229), (6, 230), (10, 231))),
+    "sharp": (ROUGH, _sharp, 4.0, ((2, 232), (5, 233), (10, 234))),
+    "absolute": (ROUGH, _absolute, 6.0, ((3, 235), (10, 236))),
+    "worst": (ROUGH, lambda x: np.max(np.abs(x) * np.linspace(1.0, 4.0, x.size)), 6.0, ((2, 242), (4, 243), (8, 244))),
+}
+TUNING |= {
+    f"{name}_{size}": Function(kind, size, _shifted(function, size, width, seed=seed))
+    for name, (kind, function, width, members) in _FAMILIES.items()
+    for size, seed in members
+}
+TUNING |= {
+    f"noisy_ellipsoid_{size}": Function(
+        ROUGH, size, _shifted(_ellipsoid(10.0), size, 6.0, seed=seed), noise=0.5, relative=0.1
+    )
+    for size, seed in ((3, 237), (6, 238), (14, 239))
 }
 
 # The functions that judge it.
