@@ -171,6 +171,8 @@ def test_an_entry_of_an_array_is_a_variable(world):
         ("plant.box.mass", "5", r"takes numbers of shape \(\), not '5'"),
         ("plant.box.mass", None, "takes numbers .* not None"),
         ("plant.box.mass", np.array(2.0 + 1.0j), "takes numbers"),
+        ("plant.box.mass", np.ma.array(3.0, mask=True), "takes numbers"),
+        ("plant.box.center_of_mass", np.ma.array(np.ones(3), mask=[0, 1, 0]), "takes numbers"),
         ("plant.box.friction", -0.1, r"must lie in \[0, inf\], but"),
         ("plant.box.pitch", 0.1, "is derived"),
         ("plant.box.inertia", [1.0, 1.0, 3.0, 0.0, 0.0, 0.0], "belongs to no rigid body"),

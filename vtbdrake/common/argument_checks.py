@@ -39,7 +39,9 @@ def as_whole(name: str, value: Any) -> int:
 
 
 def as_array(name: str, value: Any) -> np.ndarray:
-    """Return ``value`` as an array of floats; raise a ValueError if it is no array of real numbers (a text is none).
+    """Return ``value`` as an array of floats; raise a ValueError if it is no array of real numbers.
+
+    A text is none, nor has an array numbers where it is masked.
 
     Args:
         name: The argument's name, for the error message.
@@ -49,7 +51,8 @@ def as_array(name: str, value: Any) -> np.ndarray:
         array = np.asarray(value)
     except ValueError:  # A ragged list.
         array = np.array(None)
-    if array.dtype.kind not in "biuf":
+    is_masked = isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)
+    if array.dtype.kind not in "biuf" or is_masked:
         raise ValueError(f"{name} must be a number or several, not {value!r}")
     return array.astype(float)
 

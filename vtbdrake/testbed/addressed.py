@@ -56,6 +56,18 @@ def check_root(diagram: Diagram, context: Context) -> None:
         raise ValueError(_NO_CONTEXT) from error
 
 
+def check_boundary(simulator: Simulator, time: float) -> None:
+    """Raise a ValueError if a simulator cannot advance to a time, where Drake would end the process.
+
+    Args:
+        simulator: The simulator.
+        time: The time in s, which is not before the present one.
+    """
+    now = simulator.get_context().get_time()
+    if not time >= now:
+        raise ValueError(f"the simulation is at {now:.9g} s, and cannot advance to {time} s")
+
+
 class WatchedSimulator(Simulator):
     """Drake's Simulator, which raises a `NoProgressError` where its integrator would shorten a step for ever.
 
@@ -69,6 +81,7 @@ class WatchedSimulator(Simulator):
         self._watch = target.step_watch(self)
 
     def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        check_boundary(self, boundary_time)
         with self._watch:
             return super().AdvanceTo(boundary_time, interruptible)
 

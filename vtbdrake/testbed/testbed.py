@@ -19,7 +19,7 @@ from vtbdrake.common.failures import FAILURES
 from vtbdrake.drake_workarounds.cenic import CenicSimulator
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.testbed.addressed import AddressedDiagram, WatchedSimulator
+from vtbdrake.testbed.addressed import AddressedDiagram, WatchedSimulator, check_boundary
 from vtbdrake.testbed.signal import SignalError
 from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
@@ -213,6 +213,7 @@ class _NamingCenicSimulator(CenicSimulator):
         self._testbed = testbed
 
     def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        check_boundary(self, boundary_time)
         with _refused_command(self._testbed, self):
             return super().AdvanceTo(boundary_time, interruptible)
 
