@@ -5,18 +5,12 @@ a tripod, a third of the weight on the moon, into level soil without friction, a
 which two triangles of the ground meet. It prints how deep the foot sinks in, and the force to the side over the load.
 Both should be the same everywhere: the ground is level, and the line is only in its representation.
 
-**Law of the soil.** Under a plate of the width b, the pressure at the sinkage z is (k_c / b + k_phi) z (Bekker, with
-the exponent 1), with k_c = 1.4 kN/m^2 and k_phi = 820 kN/m^3 for the moon (Lunar Sourcebook, chapter 9, 1991). Summed
-over the part of a sphere of the radius r that is in the ground, with b = r, the force is
+The law of the soil is Bekker's, for the moon (`vtbdrake_diagrams.space_climber.soil`). Contact at points is linear: its
+stiffness is the one that gives the sinkage of this law at the load. A compliant hydroelastic foot on rigid ground
+follows the law itself.
 
-    F(z) = pi k (r z^2 - z^3 / 3),   k = k_c / r + k_phi.
-
-Contact at points is linear: its stiffness is F / z at the load. A foot that is compliant and hydroelastic, on rigid
-ground, has the pressure E (1 - s / r) at the distance s from its centre, and so the force
-
-    F(z) = pi E (z^2 - 2 z^3 / (3 r)).
-
-With E = k r this is the soil's law for small z; E is chosen so that both agree at the load.
+``--craters N`` lets the climber walk 300 s straight ahead in N craters, from ``--seed`` on, on rigid ground and on such
+soil (`SoilCraterScenario`), with the same integrator, and prints where it is then.
 
 **What a foot feels beside the line, at points.** The centre is at the height h = r - z and at the distance x from the
 line. One part is below it: a force k z upwards. The nearest point of the second part is on the line, at the distance
@@ -28,13 +22,12 @@ the depths and normals that it finds between a sphere and a `Convex` are others 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import process_time
 
 import click
 import numpy as np
 from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
     AddContactMaterial,
     AddRigidHydroelasticProperties,
     Box,
@@ -48,24 +41,18 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from scipy.optimize import brentq
 
 from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.meshes import obj_mesh
-from vtbdrake_diagrams.space_climber.morphology import LUNAR_GRAVITY, Morphology
+from vtbdrake_diagrams.space_climber.morphology import LUNAR_GRAVITY
+from vtbdrake_diagrams.space_climber.soil import LOAD, RADIUS, Soil, SoilCraterScenario
 from vtbdrake_diagrams.space_climber.terrain import prism
 
-COHESIVE = 1.4e3
-"""Bekker's k_c of lunar soil, in N/m^2."""
-FRICTIONAL = 820e3
-"""Bekker's k_phi of lunar soil, in N/m^3."""
-RADIUS = Morphology().foot_radius
-"""Radius of the foot in m."""
-LOAD = Morphology().total_mass * LUNAR_GRAVITY / 3.0
-"""Load on the foot in N."""
 PLACES = (0.0, 0.001, 0.005, 0.01, 0.015, 0.02, 0.03)
 """Distances of the foot beside the line, in m."""
+HORIZON = 300.0
+"""The longest time of a walk in a crater, in s."""
 RIGID = 1e6
 """Stiffness of contact at points that counts as rigid, in N/m."""
 SLOPE = np.radians(10.0)
@@ -78,31 +65,8 @@ _DEPTH = 0.3
 _DURATION = 3.0
 # The time step of the plant in s.
 _STEP = 2e-3
-# Edge length of the triangles of a hydroelastic foot, as a share of its radius.
-_RESOLUTION = 0.25
 
 Parts = list[tuple[RigidTransform, Shape]]
-
-
-def sphere_force(z: float) -> float:
-    """Return the force in N of the soil on the foot at a sinkage z in m."""
-    return float(np.pi * (COHESIVE / RADIUS + FRICTIONAL) * (RADIUS * z**2 - z**3 / 3.0))
-
-
-def sinkage() -> float:
-    """Return the sinkage of the foot under its load in m, by the law of the soil."""
-    return float(brentq(lambda z: sphere_force(z) - LOAD, 0.0, RADIUS))
-
-
-def stiffness() -> float:
-    """Return the stiffness of contact at points that gives this sinkage, in N/m."""
-    return LOAD / sinkage()
-
-
-def modulus() -> float:
-    """Return the hydroelastic modulus of a foot with this sinkage on rigid ground, in Pa."""
-    z = sinkage()
-    return float(LOAD / (np.pi * (z**2 - 2.0 * z**3 / (3.0 * RADIUS))))
 
 
 def corners(slope: float) -> Array:
@@ -155,7 +119,7 @@ class Ground:
 
 def grounds() -> list[Ground]:
     """Return the representations that are compared."""
-    soft = stiffness()
+    soft = Soil().stiffness()
     return [
         Ground("prisms, rigid, at points", two_prisms, RIGID),
         Ground("one box, soft, at points", one_box, soft),
@@ -191,7 +155,7 @@ def pressed(ground: Ground, place: float, *, slope: float = 0.0) -> Pressed:
     soil, sole = ProximityProperties(), ProximityProperties()
     if ground.stiffness == 0.0:
         AddRigidHydroelasticProperties(0.1, soil)
-        AddCompliantHydroelasticProperties(_RESOLUTION * RADIUS, modulus(), sole)
+        Soil().add_to_foot(sole)
         AddContactMaterial(None, None, smooth, soil)
         AddContactMaterial(None, None, smooth, sole)
     else:  # Two equal stiffnesses in series are half of each.
@@ -203,7 +167,7 @@ def pressed(ground: Ground, place: float, *, slope: float = 0.0) -> Pressed:
     foot = plant.AddRigidBody("foot", SpatialInertia.SolidSphereWithMass(mass, RADIUS))
     plant.RegisterCollisionGeometry(foot, RigidTransform(), Sphere(RADIUS), "foot", sole)
     rail = plant.AddFrame(FixedOffsetFrame("rail", plant.world_frame(), RigidTransform([place, 0.0, 0.0])))
-    damping = 2.0 * np.sqrt(stiffness() * mass)
+    damping = 2.0 * np.sqrt(Soil().stiffness() * mass)
     upward = [0.0, 0.0, 1.0]
     joint = plant.AddJoint(PrismaticJoint("press", rail, foot.body_frame(), upward, -np.inf, np.inf, damping))
     plant.Finalize()
@@ -230,10 +194,35 @@ def row(ground: Ground) -> tuple[str, ...]:
 HEADER = ("ground", *(f"{1e3 * place:g} mm" for place in PLACES), "in a valley of 10 deg", "ms per step")
 
 
-@click.command()
-def main() -> None:
+def walk_row(seed: int) -> tuple[str, ...]:
+    """Return the row of one crater: where the climber is after 300 s at most, on rigid ground and on soil."""
+    soil = SoilCraterScenario(seed=seed)
+    rigid = replace(soil, plant_config=replace(soil.plant_config, contact_model="point"))
+    cells = []
+    for scenario in (rigid, soil):
+        testbed = scenario.build()
+        context = testbed.default_context()
+        testbed.simulator(context).AdvanceTo(HORIZON)
+        x, y, z = testbed.read(context, "sim.sys.climber.base.pose")[:3]
+        cells.append(f"{np.hypot(x, y):.1f} m from the axis, {z:.1f} m high, {context.get_time():.0f} s")
+    return str(seed), *cells
+
+
+WALK_HEADER = ("crater", "rigid ground", "soil")
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--craters", default=0, help="Number of craters in which the climber walks.")
+@click.option("--seed", default=0, help="The first crater.")
+def main(craters: int, seed: int) -> None:
     """Press the foot into each representation of the ground, and print the table."""
-    print(f"load {LOAD:.2f} N, sinkage {1e3 * sinkage():.1f} mm, {stiffness():.0f} N/m, modulus {modulus():.0f} Pa")
+    if craters:
+        print(table(WALK_HEADER, [walk_row(each) for each in range(seed, seed + craters)]))
+        return
+    soil = Soil()
+    print(
+        f"load {LOAD:.2f} N, sinkage {1e3 * soil.sinkage():.1f} mm, {soil.stiffness():.0f} N/m, {soil.modulus():.0f} Pa"
+    )
     print("Sinkage in mm and force to the side over the load, by the distance beside the line; sinkage in a valley:")
     print(table(HEADER, [row(ground) for ground in grounds()]))
 
