@@ -22,6 +22,7 @@ the depths and normals that it finds between a sphere and a `Convex` are others 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from time import process_time
 
@@ -197,7 +198,9 @@ HEADER = ("ground", *(f"{1e3 * place:g} mm" for place in PLACES), "in a valley o
 def walk_row(seed: int) -> tuple[str, ...]:
     """Return the row of one crater: where the climber is after 300 s at most, on rigid ground and on soil."""
     soil = SoilCraterScenario(seed=seed)
-    rigid = replace(soil, plant_config=replace(soil.plant_config, contact_model="point"))
+    at_points = copy(soil.plant_config)
+    at_points.contact_model = "point"
+    rigid = replace(soil, plant_config=at_points)
     cells = []
     for scenario in (rigid, soil):
         testbed = scenario.build()
