@@ -6,10 +6,12 @@ the pushes of `vtbdrake_diagrams.quadruped.studies.pushes`.
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
 
+import casadi
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -18,6 +20,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved_values, processor_time, ratio, spread
+from benchmarks.predictive_sampling import judo_answer, without_judo
 from vtbdrake.reasoning import Budget, Reasoner
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.quadruped.decision import LIMITS, SIGMA, cost, reasoning
@@ -28,6 +31,8 @@ from vtbdrake_diagrams.quadruped.scenario import QuadrupedScenario, present_angl
 from vtbdrake_diagrams.quadruped.studies.pushes import SIZES, shares
 
 GOAL = 0.015  # s
+# The places of the plant's state in MuJoCo's [time, qpos, qvel].
+_DRAKE_ORDER = [4, 5, 6, 7, 1, 2, 3, *range(8, 20), 23, 24, 25, 20, 21, 22, *range(26, 38)]
 DEADLINE = "a robot that decides at 50 Hz has 20 ms, and a quarter goes to loop and communication"
 
 
@@ -59,7 +64,7 @@ def legged_replanning(repeats: int = 60) -> list[Benchmark]:
             better=LOWER,
             against=f"nothing: the processor time of a decision of {per_plan}",
             note=f"{spread(1e3 * ours, unit='ms')}; plans per second of one core: {1.0 / np.median(ours):.0f}, with "
-            f"mujoco.rollout {mujoco.__version__} {1.0 / np.median(theirs):.0f}",
+            f"mujoco.rollout {mujoco.__version__} {1.0 / np.median(theirs):.0f}, with {judo(planner, state, repeats)}",
             absolute=DEADLINE,
         ),
         Benchmark(
@@ -71,6 +76,49 @@ def legged_replanning(repeats: int = 60) -> list[Benchmark]:
             against=f"plans per second of mujoco.rollout {mujoco.__version__}, 1 thread, bare model: {per_plan}",
         ),
     ]
+
+
+def judo(planner: MujocoPlanner, state: np.ndarray, repeats: int) -> str:
+    """Say how many plans per second of one core judo makes from a state of the plant, or why it does not run here."""
+    scenario, present = QuadrupedScenario(), 0.62
+    controls, at_state = judo_functions(scenario)
+    settings = {
+        "model": mjcf(scenario.mental_period),
+        "candidates": scenario.rollouts,
+        "knots": scenario.knots,
+        # judo takes one step more for each that is begun.
+        "horizon": scenario.mental_period * (int(scenario.duration / scenario.mental_period + 1e-9) - 0.5),
+        "spread": float(SIGMA * 2.0 * LIMITS[0]),
+        "limits": LIMITS.tolist(),
+        "state": _full_physics(state, present)[1:].tolist(),
+        "time": present,
+        "controls": controls.serialize(),
+        "cost": at_state.serialize(),
+        "repeats": repeats,
+    }
+    try:
+        answer = judo_answer(settings)
+    except (OSError, subprocess.SubprocessError) as error:
+        return without_judo(error)
+    expected = float(planner.costs(np.zeros((scenario.rollouts, scenario.knots, len(OFFSETS))), state, present)[0])
+    apart = abs(answer["cost"] - expected) / expected
+    rate = 1.0 / np.median(answer["processor"])
+    return f"judo-rai {answer['version']} {rate:.0f} (cost of the trot without offsets {apart:.1g} apart)"
+
+
+def judo_functions(scenario: QuadrupedScenario) -> tuple[casadi.Function, casadi.Function]:
+    """Return the functions of `benchmarks.judo_plans`: (offsets, t) -> controls, (MuJoCo's [q; v], offsets) -> cost."""
+    gains, step = Quadruped(), scenario.mental_period
+    offset, t, state = casadi.SX.sym("offset", len(OFFSETS)), casadi.SX.sym("t"), casadi.SX.sym("state", 37)
+    # A plan that stays at these offsets.
+    plan = casadi.vertcat(t, *[offset] * scenario.knots)
+    desired, _ = desired_state(gains, Trot(), scenario.plan(), lead=step)(plan, casadi.SX.zeros(2), t)
+    controls = desired[:12] + gains.damping / gains.stiffness * desired[12:]
+    drake = casadi.vertcat(t, state)[_DRAKE_ORDER]
+    return (
+        casadi.Function("controls", [offset, t], [controls]),
+        casadi.Function("cost", [state, offset], [casadi.substitute(cost(drake, np.zeros(2), offset), t, 0.0)]),
+    )
 
 
 def pushed(testbed: VirtualTestbed) -> Context:
@@ -164,7 +212,7 @@ def _full_physics(state: np.ndarray, time: float) -> np.ndarray:
 
 def _states_of_drake(states: np.ndarray) -> np.ndarray:
     """Return states in the plant's order, with the trunk's rates in its own frame: the cost takes their length."""
-    return states[..., [4, 5, 6, 7, 1, 2, 3, *range(8, 20), 23, 24, 25, 20, 21, 22, *range(26, 38)]]
+    return states[..., _DRAKE_ORDER]
 
 
 def mjcf(step: float) -> str:

@@ -10,7 +10,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -179,8 +179,7 @@ def mujoco_model() -> str:
 
 
 def judo(repeats: int) -> str:
-    """Say how long a plan of judo takes, installed in an environment of its own, or why it does not run here."""
-    python = JUDO_ENVIRONMENT / "bin" / "python"
+    """Say how long a plan of judo takes, or why it does not run here."""
     settings = {
         "model": mujoco_model(),
         "candidates": CANDIDATES,
@@ -190,20 +189,37 @@ def judo(repeats: int) -> str:
         "state": HANGING.tolist(),
         "repeats": repeats,
     }
-    run = partial(subprocess.run, check=True, capture_output=True, text=True, timeout=900)
     try:
-        if not python.exists():
-            run([sys.executable, "-m", "venv", str(JUDO_ENVIRONMENT)])
-        run([str(python), "-m", "pip", "install", "--quiet", JUDO])
-        done = run([str(python), str(Path(__file__).with_name("judo_plans.py"))], input=json.dumps(settings))
+        answer = judo_answer(settings)
     except (OSError, subprocess.SubprocessError) as error:
-        reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        return f"no {JUDO} here ({reason[-1]})"
-    answer = json.loads(done.stdout.splitlines()[-1])
+        return without_judo(error)
     expected = float(mujoco_planner(1)(HANGING, np.zeros((1, PLAN.knots)))[0])
     # It leaves out the cost of the present state.
     apart = abs(answer["cost"] + STEP * cost(HANGING) - expected) / expected
     return f"{JUDO} {1e6 * np.median(answer['seconds']):.0f} (cost of a plan without force {apart:.1g} apart)"
+
+
+def judo_answer(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `benchmarks.judo_plans` prints for these settings; it installs judo in an environment of its own.
+
+    Raises:
+        OSError: Python cannot be run.
+        subprocess.SubprocessError: judo cannot be installed, or fails.
+    """
+    python = JUDO_ENVIRONMENT / "bin" / "python"
+    run = partial(subprocess.run, check=True, capture_output=True, text=True, timeout=900)
+    if not python.exists():
+        run([sys.executable, "-m", "venv", str(JUDO_ENVIRONMENT)])
+    run([str(python), "-m", "pip", "install", "--quiet", JUDO, f"casadi=={casadi.__version__}"])
+    done = run([str(python), str(Path(__file__).with_name("judo_plans.py"))], input=json.dumps(settings))
+    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return answer
+
+
+def without_judo(error: Exception) -> str:
+    """Say why judo does not run here."""
+    reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+    return f"no {JUDO} here ({reason[-1]})"
 
 
 def mujoco_planners() -> dict[str, Planner]:
