@@ -97,7 +97,7 @@ def test_products_of_inertia_couple_the_axes(world):
     np.testing.assert_allclose(angular, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], rtol=1e-12)
 
 
-def test_rotor_inertia_is_that_of_drakes_actuator(world):
+def test_rotor_inertia_and_gear_ratio_are_those_of_drakes_actuator(world):
     plant, variables, context, plant_context = world
     (address,) = (address for address in variables if address.endswith(".rotor_inertia"))
     actuator = plant.get_joint_actuator(plant.GetJointActuatorIndices()[0])
@@ -112,6 +112,10 @@ def test_rotor_inertia_is_that_of_drakes_actuator(world):
     assert difference[v, v] == pytest.approx(0.25 * actuator.default_gear_ratio() ** 2)
     difference[v, v] = 0.0
     np.testing.assert_allclose(difference, 0.0, atol=1e-12)
+    gear = address.replace("rotor_inertia", "gear_ratio")
+    variables[gear].set(context, 3.0)
+    assert variables[gear].get(context) == actuator.gear_ratio(plant_context) == 3.0
+    assert plant.CalcMassMatrix(plant_context)[v, v] - before[v, v] == pytest.approx(9.0 * 0.25)
 
 
 @pytest.mark.parametrize(

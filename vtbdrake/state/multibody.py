@@ -85,7 +85,7 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix = _within_plant
             yield _frame_pose(plant, frame, element_address(plant, frame, prefix))
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
-        yield _rotor_inertia(plant, actuator, element_address(plant, actuator, prefix))
+        yield from _rotor_variables(plant, actuator, element_address(plant, actuator, prefix))
     if plant.num_constraints():
         yield from _constraint_variables(plant, prefix(plant.GetModelInstanceName(default_model_instance())))
     yield from _deformable_variables(plant, prefix)
@@ -387,8 +387,8 @@ def _frame_pose(plant: MultibodyPlant, frame: FixedOffsetFrame, address: str) ->
     return _variable(plant, f"{address}.pose", A, (6,), POSE_UNIT, read, write, entry_names=POSE_NAMES)
 
 
-def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Variable:
-    return _variable(
+def _rotor_variables(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Iterator[Variable]:
+    yield _variable(
         plant,
         f"{address}.rotor_inertia",
         A,
@@ -397,6 +397,15 @@ def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str)
         actuator.rotor_inertia,
         lambda context, value: actuator.SetRotorInertia(context, float(value)),
         bounds=(0.0, inf),
+    )
+    yield _variable(
+        plant,
+        f"{address}.gear_ratio",
+        A,
+        (),
+        "1" if actuator.joint().type_name() != "prismatic" else "1/m",
+        actuator.gear_ratio,
+        lambda context, value: actuator.SetGearRatio(context, float(value)),
     )
 
 

@@ -137,6 +137,7 @@ INPUTS = {
     "slider.damping": 0.7,
     "mount.pose": [0.2, -0.3, 0.4, 0.3, -0.5, 1.1],
     "motor.rotor_inertia": 4e-3,
+    "motor.gear_ratio": 35.0,
 }
 
 
@@ -176,6 +177,8 @@ def _write(plant, context, values):
             plant.GetJointByName(name).SetDamping(context, value)
         elif quantity == "pose":
             plant.GetFrameByName(name).SetPoseInParentFrame(context, pose_from_array(np.array(value)))
+        elif quantity == "gear_ratio":
+            plant.GetJointActuatorByName(name).SetGearRatio(context, value)
         else:
             plant.GetJointActuatorByName(name).SetRotorInertia(context, value)
 

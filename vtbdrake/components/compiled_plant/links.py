@@ -111,7 +111,7 @@ def read_links(
         context: The plant's own Context.
         inputs: Addresses within the plant of the values that become symbols: ``mass``, ``center_of_mass``
             and ``inertia`` of a body, ``damping`` of a joint, ``pose`` of a frame that carries a joint, and
-            ``rotor_inertia`` of an actuator, as in `multibody_variables`.
+            ``rotor_inertia`` and ``gear_ratio`` of an actuator, as in `multibody_variables`.
         controllers: Whether actuators may have PD controllers.
 
     Raises:
@@ -260,8 +260,10 @@ class _LinkReader:
         inertias: dict[int, Expression] = {}
         for index in self._plant.GetJointActuatorIndices():
             actuator = self._plant.get_joint_actuator(index)
-            rotor = self._input(f"{self._address(actuator)}.rotor_inertia", actuator.rotor_inertia(self._context))
-            inertias[int(actuator.joint().index())] = actuator.gear_ratio(self._context) ** 2 * rotor
+            address = self._address(actuator)
+            rotor = self._input(f"{address}.rotor_inertia", actuator.rotor_inertia(self._context))
+            gear = self._input(f"{address}.gear_ratio", actuator.gear_ratio(self._context))
+            inertias[int(actuator.joint().index())] = gear**2 * rotor
         return inertias
 
     def _input(self, address: str, value: ArrayLike, rounding: float = 0.0) -> Expression:
