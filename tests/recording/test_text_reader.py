@@ -87,6 +87,8 @@ def test_columns_of_a_text(path: Path, text: bytes, columns: dict[str, list[floa
         (b"t,q\n0,1,2\n0.1,2,3\n", "row 0 has 3 columns, but there are 2 names: decimal commas"),
         (b"run 7, noon\nt,q,u\n0,1,2.5\n", "row 0 has 3 columns, but there are 2 names: is there a line above"),
         (b"Run of the arm\nt,q\n0,1\n", r"row 0 has 1 columns, not 4 .*Begin it with #"),
+        ("t,q\n0,1\n1,2\n".encode("utf-16"), "no text in UTF-8: if it is a table in UTF-16"),
+        ("t;q\n0;1\n1;2\n".encode("utf-16-le"), "no text in UTF-8"),
     ],
 )
 def test_bad_text_is_refused(path: Path, text: bytes, message: str) -> None:

@@ -76,6 +76,11 @@ class _Layout:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
             above, head = _after_comments(file)
             below, first = _after_comments(file)
+        if "\0" in head:
+            raise LogError(
+                f"{path} is no text in UTF-8: if it is a table in UTF-16, as spreadsheets write it, convert it by "
+                "iconv -f UTF-16 -t UTF-8"
+            )
         separator = next((mark for mark in ",;\t" if mark in head), None)
         if ";" in head and ";" in first:  # Its commas are decimal.
             separator = ";"
