@@ -29,7 +29,7 @@ from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform
-from vtbdrake.components.localization.range_bearing import range_bearing_landmarks
+from vtbdrake.components.localization.range_bearing import RangeBearingConfig, range_bearing_landmarks
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake_diagrams.park.reality import Drive, prepared, reckoned, surveyed, victoria_park
 from vtbdrake_diagrams.park.scenario import ParkScenario, car
@@ -44,6 +44,8 @@ _DEVIATION = 0.1
 _OTHERS = 0.1
 # A detection shows a tree within this distance, in m.
 _MATCHES = 1.0
+# What is detected between these distances of a tree, in m, is something else.
+_STRAYS = (0.4, 1.0)
 # The survey and the wheels are compared over this number of scans, about a second.
 _SCANS_AHEAD = 5
 # The survey jumps where they differ by more than this number of standard deviations.
@@ -152,6 +154,27 @@ def thinned(
     return left, scans
 
 
+def stray_density(drive: Drive, mapped: Survey, detector: RangeBearingConfig) -> float:
+    """Return the density in 1/m² of detections of something else beside a tree, for each detection of the tree.
+
+    Detections from 0.4 to 1 m beside the nearest tree of a survey show something else, nearer ones the tree.
+
+    Args:
+        drive: The surveyed drive.
+        mapped: The survey.
+        detector: The detector.
+    """
+    tree, detected = cKDTree(mapped.trees.positions), drive.log.sense["trees"]
+    places = [
+        transform(pose, range_bearing_landmarks(row, detector).positions)
+        for pose, row in zip(_poses_at(mapped, detected.times), detected.values, strict=True)
+    ]
+    distances, _ = tree.query(np.concatenate(places))
+    nearest, farthest = _STRAYS
+    strays = int(((distances >= nearest) & (distances < farthest)).sum())
+    return strays / float((distances < nearest).sum()) / (np.pi * (farthest**2 - nearest**2))
+
+
 def claims(
     drive: Drive, whole: Survey, scenario: ParkScenario, case: Case, *, seed: int, trees: int = _TREES
 ) -> Claims:
@@ -223,12 +246,15 @@ def _poses_at(whole: Survey, times: Array) -> Array:
 def report(drive: Drive, seeds: Sequence[int]) -> str:
     """Return the table for some draws of the trees: medians and the worst of them."""
     start, end = drive.log.start, drive.log.end
-    half = prepared(drive.between(start, 0.5 * (start + end)))
+    first = drive.between(start, 0.5 * (start + end))
+    half = prepared(first)
+    strays = stray_density(first, half.mapped, half.scenario.detector)
     whole = surveyed(drive, half.scenario, half.config)
     draws = {case: [claims(drive, whole, half.scenario, case, seed=seed) for seed in seeds] for case in CASES}
     is_judged = draws[CASES[0]][0].is_judged
     judge = f"the survey judges {is_judged.sum()} of {len(is_judged)} scans; draws {', '.join(map(str, seeds))}"
-    return f"{judge}\n{tabulated(draws)}"
+    beside = f"first half: {strays:.4f} detections of something else per m^2 beside a tree, for each of the tree"
+    return f"{beside}\n{judge}\n{tabulated(draws)}"
 
 
 def tabulated(draws: Mapping[Case, Sequence[Claims]]) -> str:

@@ -348,7 +348,7 @@ def test_a_displaced_or_turned_map_is_not_distorted():
         around = np.array([*middle, 0.0])
         X_WV = compose(compose(around, X), inverse(around))
         moved = replace(one, map=one.map.seen_from(X_WV), poses=np.array([compose(X_WV, pose) for pose in one.poses]))
-        assert tracked(moved)[1][-1].distortion == pytest.approx(same[-1].distortion, rel=1e-3)
+        assert tracked(moved)[1][-1].distortion == pytest.approx(same[-1].distortion, rel=1e-2)
 
 
 def turned_by_the_odometry(drift):
@@ -387,6 +387,63 @@ def test_scan_with_one_landmark_that_is_new_is_not_fused():
     after, matches = tracker.update(before, spread_out(np.array([[8.0, 4.0]]), 0.03))
     assert len(matches.pairs) == 1 and not matches.is_fused
     np.testing.assert_array_equal(after.mean, before.mean)
+
+
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_single_detection_is_matched_with_the_nearer_of_two_neighbours(order):
+    """Whatever their order on the map."""
+    places = np.array([[20.0, 0.0], [20.0, 0.8]])[order]
+    tracker = Tracker(spread_out(places, 0.02), bias_deviation=1e-6)
+    surely = np.diag([0.01, 0.01, 1e-3]) ** 2
+    state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], spread_out(places, 0.05))
+    vague = tracker.predict(state, np.zeros(3), np.diag([0.3, 0.3, 1e-3]) ** 2, extent=0.0)
+    for nearer in (0, 1):
+        _, matches = tracker.update(vague, spread_out(places[nearer : nearer + 1], 0.05))
+        assert matches.pairs.tolist() == [[0, nearer]]
+
+
+def two_landmarks(stray_density, deviations):
+    """Return a tracker, a state that has two landmarks, and their places; the pose has these standard deviations."""
+    places = np.array([[15.0, 8.0], [12.0, -9.0]])
+    tracker = Tracker(spread_out(places, 0.02), stray_density=stray_density, bias_deviation=1e-6, least_deviation=0.0)
+    surely = np.diag([1e-4, 1e-4, 1e-5]) ** 2
+    state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], spread_out(places, 1e-3))
+    return tracker, tracker.predict(state, np.zeros(3), np.diag(deviations) ** 2, extent=0.0), places
+
+
+def test_match_that_may_be_a_stray_is_weighed():
+    """As by hand, with a pose that may be displaced in x and y only, and a detection that is one of many strays."""
+    density, deviation, prior, aside = 0.5, 0.05, 0.4, np.array([0.5, -0.3])
+    tracker, state, places = two_landmarks(density, [prior, prior, 1e-6])
+    after, matches = tracker.update(state, spread_out(places[:1] - aside, deviation))
+    S, gain = prior**2 + deviation**2, prior**2 / (prior**2 + deviation**2)
+    anything = density + 2.0 / (np.pi * (places[0] - aside) @ (places[0] - aside))
+    right = np.exp(-0.5 * aside @ aside / S) / (2.0 * np.pi * S)
+    p, moved = right / (right + anything), gain * aside
+    assert 0.2 < p < 0.8 and matches.is_fused
+    np.testing.assert_allclose(after.pose[:2], state.pose[:2] + p * moved, atol=2e-3)
+    spread = p * (1.0 - p) * np.outer(moved, moved)
+    expected = (prior**2 - p * gain * prior**2) * np.eye(2) + spread
+    np.testing.assert_allclose(after.pose_covariance[:2, :2], expected, rtol=0.01, atol=1e-4)
+
+
+def test_strays_do_not_make_an_uncertain_pose_too_sure():
+    """One detection of twenty shows something else, up to a metre beside: 0.016 of them in a square metre."""
+    deviations, rng, squares = np.array([0.4, 0.4, 0.05]), np.random.default_rng(0), {0.0: [], 0.016: []}
+    units = {density: two_landmarks(density, deviations) for density in squares}
+    for _ in range(200):
+        truth = deviations * rng.normal(size=3)
+        aside, turn = (rng.random(2) < 0.05) * np.sqrt(rng.random(2)), rng.uniform(0.0, 2.0 * np.pi, 2)
+        noise = 0.05 * rng.normal(size=(2, 2)) + aside[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        for density, (tracker, state, places) in units.items():
+            detections = spread_out(transform(inverse(truth), places) + noise, 0.05)
+            after, matches = tracker.update(state, detections)
+            if matches.is_fused:
+                squares[density].append(nees(after.pose, after.pose_covariance, truth))
+    beyond = {density: np.mean(np.array(values) > chi2.ppf(0.999, 3)) for density, values in squares.items()}
+    assert min(len(values) for values in squares.values()) > 190
+    assert np.mean(squares[0.0]) > 6.0 and np.mean(squares[0.016]) < 4.0
+    assert beyond[0.016] < 0.03 < beyond[0.0], beyond
 
 
 def along_a_line(seed, share):

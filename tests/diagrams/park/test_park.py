@@ -10,11 +10,13 @@ from tests.real import recordings
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
-from vtbdrake.components.localization.range_bearing import range_bearing_landmarks
+from vtbdrake.components.localization.range_bearing import RangeBearingConfig, range_bearing_landmarks
 from vtbdrake.components.localization.unit import TRACKING
+from vtbdrake.recording import Log, Series
 from vtbdrake_diagrams.park import ParkScenario
-from vtbdrake_diagrams.park.few_landmarks import Case, Claims, claims, judging, tabulated, thinned
+from vtbdrake_diagrams.park.few_landmarks import Case, Claims, claims, judging, stray_density, tabulated, thinned
 from vtbdrake_diagrams.park.reality import (
+    Drive,
     judged_by_positions,
     laid_onto,
     localized,
@@ -23,7 +25,7 @@ from vtbdrake_diagrams.park.reality import (
     slide,
     victoria_park,
 )
-from vtbdrake_diagrams.park.scenario import PERIOD
+from vtbdrake_diagrams.park.scenario import PERIOD, ROWS
 from vtbdrake_diagrams.park.survey import Survey, SurveyConfig, survey
 
 pytestmark = pytest.mark.one_python
@@ -158,6 +160,24 @@ def test_errors_of_real_detections_last_while_the_car_moves_on(drive, half):
 
     near, farther, far = correlation(0.2, 1.0), correlation(6.0, 10.0), correlation(20.0, 40.0)
     assert 0.3 < near < 0.5 and 0.2 * near < farther < 0.5 * near and abs(far) < 0.1
+
+
+@pytest.mark.slow
+def test_density_of_real_detections_beside_trees(drive, half):
+    """As `ParkScenario` assumes; the whole first half: python -m vtbdrake_diagrams.park.few_landmarks."""
+    assert 0.005 < stray_density(drive.between(0.0, 200.0), half.mapped, half.scenario.detector) < 0.015
+
+
+def test_density_of_simulated_detections_beside_a_tree():
+    """One of ten lies between 0.4 and 1 m beside it: one ninth on 2.6 m^2."""
+    rows = np.zeros((10, 3 * ROWS))
+    rows[:, :3] = [10.0, 0.0, 0.3]
+    rows[9, 0] = 10.7
+    log = Log("one tree", {"trees": Series(np.arange(10.0), rows)}, {})
+    tree = Landmarks(np.array([[10.0, 0.0]]), np.zeros((1, 2, 2)), np.array([0.3]), np.zeros(1))
+    mapped = Survey(np.arange(10.0), np.zeros((10, 3)), tree, 0.0)
+    density = stray_density(Drive(log, np.zeros((0, 3))), mapped, RangeBearingConfig())
+    assert density == pytest.approx(1.0 / 9.0 / (np.pi * (1.0 - 0.16)))
 
 
 @pytest.mark.slow

@@ -1,12 +1,15 @@
 """Association of the detections of a scan with the landmarks of a map, around a pose that is known roughly.
 
 Pairs of detection and landmark within a gate on the Mahalanobis distance, d² = νᵀ S⁻¹ ν with the innovation ν and its
-covariance S, are hypotheses. The one that agrees with most others, after the state has been conditioned on it, decides
-which pairs are possible; the best one-to-one assignment among them is taken. Diameters count in the assignment.
+covariance S, are hypotheses. The anchor is the pair that agrees best: with the state, and with most others, after the
+state has been conditioned on it. It decides which pairs are possible; the best one-to-one assignment among them is
+taken. Diameters count in the assignment.
 
-The first match of a landmark, which is not in the state yet, may be wrong: its probability p is its density, divided by
-the sum of the densities of this pair, of all pairs that exclude it, and of what the map does not show. It must be at
-least 0.8, and d² within a narrower gate, because another landmark may be near on the map.
+A match may be wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs
+that exclude it, and of what the map does not show. The anchor itself, and the pairs that exclude it, have their
+densities given the pair that agrees best with the anchor. The first match of a landmark, which is not in the state yet,
+needs at least 0.8, and d² within a narrower gate, because another landmark may be near on the map. What the map does
+not show lies anywhere, or beside a landmark (``stray_density``): branches, lower parts of a trunk, a second tree.
 """
 
 from __future__ import annotations
@@ -46,20 +49,23 @@ class MatchedPairs(NamedTuple):
         pairs: Indices of the detection and of the landmark on the map, (k, 2).
         squares: Their d², (k,).
         probability: The probabilities that they are right, (k,).
+        rivals: The densities of what else the detections may show, other landmarks or something beside them, over the
+            likelihood ratios of their diameters, in 1/m², (k,).
     """
 
     pairs: Indices
     squares: Array
     probability: Array
+    rivals: Array
 
     @classmethod
     def none(cls) -> MatchedPairs:
         """Return no matches."""
-        return cls(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0))
+        return cls(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0), np.zeros(0))
 
-    def select(self, mask: NDArray[np.bool_]) -> MatchedPairs:
-        """Return the matches for which a mask (k,) is true."""
-        return MatchedPairs(self.pairs[mask], self.squares[mask], self.probability[mask])
+    def select(self, mask: NDArray[np.bool_] | Indices) -> MatchedPairs:
+        """Return the matches for which a mask (k,) is true, or those with these indices, in their order."""
+        return MatchedPairs(*(each[mask] for each in self))
 
     def first(self, count: int) -> MatchedPairs:
         """Return the first ``count`` matches."""
@@ -99,6 +105,7 @@ class Association:
         variances: Variances of the expected detections of these in m², (n,), without the pose's variance.
         gate: The share of right pairs that the gate lets pass.
         first_gate: The same of first matches.
+        stray_density: The density of detections of something else around a landmark of the map, in 1/m².
     """
 
     landmarks: Landmarks
@@ -106,6 +113,7 @@ class Association:
     variances: Array
     gate: float
     first_gate: float
+    stray_density: float = 0.0
     _tree: cKDTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -167,20 +175,23 @@ class Association:
         i, j = np.nonzero(squares < threshold)
         if not len(i):
             return MatchedPairs.none()
-        agreeing, determinant = _agreeing(i, j, innovations[i, j], covariances[i, j], expected.covariance, threshold)
-        cost = agreeing + np.log(determinant) + self._diameter_cost(detections.select(i), sizes[0][j], sizes[1][j])
+        compared = _compared(i, j, innovations[i, j], covariances[i, j], expected.covariance, threshold)
+        diameter_cost = self._diameter_cost(detections.select(i), sizes[0][j], sizes[1][j])
+        cost = compared.squares + np.log(compared.determinants) + diameter_cost
         gain = np.zeros(squares.shape)
-        is_possible = agreeing < threshold
+        is_possible = (compared.squares < threshold) & ~compared.is_excluded
         gain[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
         rows, columns = one_to_one(gain)
-        density = np.zeros(squares.shape)
+        density, diameter_ratio = np.zeros(squares.shape), np.ones(squares.shape)
         density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
+        diameter_ratio[i, j] = np.exp(-0.5 * diameter_cost)
         area = 0.5 * field_of_view * max(1.0, float((detections.positions**2).sum(axis=1).max()))
-        unmapped = _UNMAPPED_ODDS * len(detections) / area
-        rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
-        probability = (density / (unmapped + rivals))[rows, columns]
+        unmapped = _UNMAPPED_ODDS * len(detections) / area + self.stray_density
+        rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - 2.0 * density + unmapped
+        probability = (density / (density + rivals))[rows, columns]
         pairs = np.column_stack([rows, expected.indices[columns]])
-        matches = MatchedPairs(pairs, squares[rows, columns], probability)
+        odds = (rivals / diameter_ratio)[rows, columns]
+        matches = MatchedPairs(pairs, squares[rows, columns], probability, odds)
         is_sure = (probability >= _LEAST_PROBABILITY) & (matches.squares < chi_square_quantile(self.first_gate, 2))
         return matches.select(is_sure | ~expected.is_first[columns])
 
@@ -202,10 +213,25 @@ class Association:
         return np.minimum(cost, _DIAMETER_CAP)
 
 
-def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> tuple[Array, Array]:
-    """Return the d² (k,) of pairs after conditioning on the one with which most others agree.
+class _Comparison(NamedTuple):
+    """Pairs within the gate, compared after conditioning on the anchor.
 
-    Also returned are the determinants, (k,) in m^4, of the conditional covariances; that pair keeps its own.
+    The anchor and the pairs that exclude it are conditioned on the pair that agrees best with it; without one, they
+    keep their own d² and covariances.
+
+    Attributes:
+        squares: The d² of the pairs, (k,).
+        determinants: The determinants of their covariances in m^4, (k,).
+        is_excluded: Whether the pair shares its detection or its landmark with the anchor, (k,).
+    """
+
+    squares: Array
+    determinants: Array
+    is_excluded: NDArray[np.bool_]
+
+
+def _compared(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> _Comparison:
+    """Return k pairs, compared.
 
     Args:
         i: The detections of the pairs, (k,).
@@ -220,12 +246,18 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     K = C @ np.linalg.inv(S[tried])
     rest = nu[:, None] - np.einsum("pqij,qj->pqi", K, nu[tried])
     spread = S[:, None] - K @ C.transpose(0, 1, 3, 2)
-    spread[tried, np.arange(len(tried))] = S[tried]
-    squares = squared_distances(rest, spread)
     is_itself = np.arange(len(i))[:, None] == tried
-    is_rival = (i[:, None] == i[tried]) | (j[:, None] == j[tried])
-    squares = np.where(is_itself, 0.0, np.where(is_rival, np.inf, squares))
+    excludes = ((i[:, None] == i[tried]) | (j[:, None] == j[tried])) & ~is_itself
+    squares, own = np.where(excludes, np.inf, squared_distances(rest, spread)), squared_distances(nu, S)
     agreement = np.zeros((i.max() + 1, len(tried)))
-    np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
-    best = np.argmax(agreement.sum(axis=0))
-    return squares[:, best], np.maximum(np.linalg.det(spread[:, best]), 1e-12)
+    np.maximum.at(agreement, i, np.maximum(threshold - np.where(is_itself, own[:, None], squares), 0.0))
+    anchor = np.argmax(agreement.sum(axis=0))
+    is_excluded = excludes[:, anchor]
+    kept = is_itself[:, anchor] | is_excluded
+    conditional, covariances = squares[:, anchor].copy(), spread[:, anchor].copy()
+    agreeing = np.where(kept, np.inf, conditional)[tried]
+    partner = np.argmin(agreeing)
+    has_partner = agreeing[partner] < threshold
+    conditional[kept] = squares[kept, partner] if has_partner else own[kept]
+    covariances[kept] = spread[kept, partner] if has_partner else S[kept]
+    return _Comparison(conditional, np.maximum(np.linalg.det(covariances), 1e-12), is_excluded)

@@ -42,6 +42,14 @@ next, after the way d; in the sum of many sights, such errors count as independe
 their variance. So the variance R of a detection is R [1 + 2 w ρ / (1 - ρ)] in the correction, but R in the association
 and in the test of the innovation. Who stands still learns nothing from further scans.
 
+A detection may show something beside the landmark that it is matched with. Where few landmarks are seen, nothing
+contradicts it, and most of all where the pose was uncertain, it moves the pose by much. With ``stray_density``, the
+hypotheses are that all k pairs of a scan are right, or that one of them is wrong and says nothing. Pair i has the odds
+c_i / N(r_i; 0, R_i), where c_i is the density of what else the detection may show, and r_i its innovation given the
+other pairs, with the covariance R_i. The estimate is the mean of these hypotheses' estimates, and its covariance
+contains how far they lie apart, as in the probabilistic data association filter (Bar-Shalom and Tse, "Tracking in a
+cluttered environment with probabilistic data association", Automatica 11, 1975; here with one wrong pair at most).
+
 A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees.
 
 If the map is revised (``revises``), a detection that can show no landmark of the map and none of the state begins a
@@ -220,6 +228,13 @@ class Tracker:
     lasting_length: float = setting(
         8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
     )
+    stray_density: float = setting(
+        0.0,
+        "The density of detections of something else around a landmark of the map; 0: pairs in the gates count as "
+        "right.",
+        unit="1/m^2",
+        ge=0.0,
+    )
     revises: bool = setting(
         False, "Whether landmarks that the map lacks are added, and landmarks that are gone are dropped."
     )
@@ -246,7 +261,7 @@ class Tracker:
             )
         # Variances of an expected detection without the pose's: of the landmark, of the bias and of the scan.
         spread = variances[usable].astype(float) + self.bias_deviation**2 + self.scan_deviation**2
-        association = Association(self.landmarks, usable, spread, self.gate, self.first_gate)
+        association = Association(self.landmarks, usable, spread, self.gate, self.first_gate, self.stray_density)
         object.__setattr__(self, "_association", association)
 
     def start(
@@ -269,7 +284,7 @@ class Tracker:
         view = self._widened(landmarks)
         matches = self._associate(state, view).first(self.most)
         loose = self._at(pose, np.diag(_LOOSE**2))
-        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), view, matches.pairs)
+        return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), view, matches)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, extent: float) -> TrackState:
         """Return the state after a motion.
@@ -328,7 +343,8 @@ class Tracker:
             return self._revised(state.with_arrays(unjudged=unjudged), view, matches.pairs), Matches(matches.pairs)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
-        fused, remaining = self._fused(extended, view, np.vstack([matches.pairs[~is_first], first.pairs]))
+        ordered = matches.select(np.argsort(is_first, kind="stable"))
+        fused, remaining = self._fused(extended, view, ordered)
         # Too few of the pairs may be left.
         fails, unjudged = self._judged(state, view, remaining.pairs)
         if fails:
@@ -466,9 +482,9 @@ class Tracker:
         covariance = HPHt.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
         return ExpectedDetections(extended.indices[rows], rows >= len(state.indices), positions, covariance)
 
-    def _fused(self, state: TrackState, view: SensorView, pairs: Indices) -> tuple[TrackState, Matches]:
+    def _fused(self, state: TrackState, view: SensorView, matches: MatchedPairs) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
-        detections = view.landmarks
+        detections, pairs, rivals = view.landmarks, matches.pairs, matches.rivals
         # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
         while len(pairs):
             rows = places_of(state.indices, pairs[:, 1])
@@ -482,16 +498,21 @@ class Tracker:
             parts = (nu * weighted).reshape(-1, 2).sum(axis=1)
             if parts.sum() <= chi_square_quantile(self.gate, 2 * len(pairs)):
                 break
-            pairs = np.delete(pairs, np.argmax(parts), axis=0)
+            worst = np.argmax(parts)
+            pairs, rivals = np.delete(pairs, worst, axis=0), np.delete(rivals, worst)
         else:
             return state, _NO_MATCHES
         nis, repeated = float(parts.sum()), self._repeated(state, rows)
+        odds = _stray_odds(S, nu, rivals) if self.stray_density else None
         if repeated.any():
             S += block_diag(*(repeated[:, None, None] * detections.covariances[pairs[:, 0]]))
             factor = cho_factor(S, lower=True)
             weighted = cho_solve(factor, nu)
-        K = cho_solve(factor, PHt.T).T
-        P = state.covariance - PHt @ K.T
+        if odds is None:
+            P = state.covariance - PHt @ cho_solve(factor, PHt.T)
+        else:
+            weighted, information = _mixed(S, nu, odds)
+            P = state.covariance - PHt @ information @ PHt.T
         mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
         seen_at = state.seen_at.copy()
         seen_at[rows] = state.travelled
@@ -634,6 +655,52 @@ class Tracker:
 def _variance_within(gate: float) -> float:
     """Return the variance, per axis, of the share of a standard normal distribution in the plane that passes a gate."""
     return 1.0 + 0.5 * (1.0 - 1.0 / gate) * chi_square_quantile(gate, 2)
+
+
+def _stray_odds(S: Array, nu: Array, rivals: Array) -> Array:
+    """Return the odds that one pair is wrong and all others are right, against all right, (k,).
+
+    Args:
+        S: The covariance of the innovations in m², (2 k, 2 k).
+        nu: The innovations in m, (2 k,).
+        rivals: The densities of what else each detection may show, in 1/m², (k,).
+    """
+    W = np.linalg.inv(S)
+    # The innovation of a pair less what the others say of it is W_ii⁻¹ (W ν)_i, with the covariance W_ii⁻¹.
+    own, weighted = _blocks(W), (W @ nu).reshape(-1, 2)
+    squares = np.einsum("ni,nij,nj->n", weighted, np.linalg.inv(own), weighted)
+    odds: Array = rivals * 2.0 * np.pi * np.exp(0.5 * squares) / np.sqrt(np.linalg.det(own))
+    return odds
+
+
+def _mixed(S: Array, nu: Array, odds: Array) -> tuple[Array, Array]:
+    """Return a and B, with which the state moves by P Hᵀ a and its covariance falls by P Hᵀ B H P.
+
+    They are the mean and the covariance of a mixture: all pairs are right, or one of them is wrong.
+
+    Args:
+        S: The covariance of the innovations in m², (2 k, 2 k).
+        nu: The innovations in m, (2 k,).
+        odds: The odds of each pair to be wrong, (k,).
+    """
+    W, k = np.linalg.inv(S), len(odds)
+    columns = W.reshape(2 * k, k, 2).transpose(1, 0, 2)
+    gains = columns @ np.linalg.inv(_blocks(W))
+    # Without pair i: W less W_:i W_ii⁻¹ W_i:.
+    without = W - gains @ columns.transpose(0, 2, 1)
+    hypotheses = np.concatenate([W[None], without])
+    weights = np.concatenate([[1.0], odds]) / (1.0 + odds.sum())
+    steps = hypotheses @ nu
+    a = weights @ steps
+    B = np.einsum("h,hij->ij", weights, hypotheses) - (weights[:, None] * steps).T @ steps + np.outer(a, a)
+    return a, B
+
+
+def _blocks(W: Array) -> Array:
+    """Return the blocks on the diagonal of a matrix (2 k, 2 k), (k, 2, 2)."""
+    k = np.arange(len(W) // 2)
+    blocks: Array = W.reshape(len(k), 2, len(k), 2)[k, :, k]
+    return blocks
 
 
 def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
