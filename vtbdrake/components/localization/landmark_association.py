@@ -65,7 +65,7 @@ class MatchedPairs(NamedTuple):
 
     def select(self, mask: NDArray[np.bool_] | Indices) -> MatchedPairs:
         """Return the matches for which a mask (k,) is true, or those with these indices, in their order."""
-        return MatchedPairs(*(each[mask] for each in self))
+        return MatchedPairs(self.pairs[mask], self.squares[mask], self.probability[mask], self.rivals[mask])
 
     def first(self, count: int) -> MatchedPairs:
         """Return the first ``count`` matches."""

@@ -228,13 +228,6 @@ class Tracker:
     lasting_length: float = setting(
         8.0, "The distance λ over which that share loses two thirds of its correlation; assumed.", unit="m", gt=0.0
     )
-    stray_density: float = setting(
-        0.0,
-        "The density of detections of something else around a landmark of the map; 0: pairs in the gates count as "
-        "right.",
-        unit="1/m^2",
-        ge=0.0,
-    )
     revises: bool = setting(
         False, "Whether landmarks that the map lacks are added, and landmarks that are gone are dropped."
     )
@@ -244,6 +237,13 @@ class Tracker:
         "lean. It is in the covariances of added landmarks; their detections are fused as independent. Calibrated with "
         "simulated scans of `vtbdrake_diagrams.forest`, whose trunks lean by 0.01 rad.",
         unit="m",
+        ge=0.0,
+    )
+    stray_density: float = setting(
+        0.0,
+        "The density of detections of something else around a landmark of the map; 0: pairs in the gates count as "
+        "right.",
+        unit="1/m^2",
         ge=0.0,
     )
     _association: Association = field(init=False, repr=False)
@@ -665,7 +665,7 @@ def _stray_odds(S: Array, nu: Array, rivals: Array) -> Array:
         nu: The innovations in m, (2 k,).
         rivals: The densities of what else each detection may show, in 1/m², (k,).
     """
-    W = np.linalg.inv(S)
+    W = np.asarray(np.linalg.inv(S), dtype=float)
     # The innovation of a pair less what the others say of it is W_ii⁻¹ (W ν)_i, with the covariance W_ii⁻¹.
     own, weighted = _blocks(W), (W @ nu).reshape(-1, 2)
     squares = np.einsum("ni,nij,nj->n", weighted, np.linalg.inv(own), weighted)
@@ -683,7 +683,8 @@ def _mixed(S: Array, nu: Array, odds: Array) -> tuple[Array, Array]:
         nu: The innovations in m, (2 k,).
         odds: The odds of each pair to be wrong, (k,).
     """
-    W, k = np.linalg.inv(S), len(odds)
+    W = np.asarray(np.linalg.inv(S), dtype=float)
+    k = len(odds)
     columns = W.reshape(2 * k, k, 2).transpose(1, 0, 2)
     gains = columns @ np.linalg.inv(_blocks(W))
     # Without pair i: W less W_:i W_ii⁻¹ W_i:.
