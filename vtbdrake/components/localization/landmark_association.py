@@ -1,9 +1,9 @@
 """Association of the detections of a scan with the landmarks of a map, around a pose that is known roughly.
 
 Pairs of detection and landmark within a gate on the Mahalanobis distance, d² = νᵀ S⁻¹ ν with the innovation ν and its
-covariance S, are hypotheses. The anchor is the pair that agrees best: with the state, and with most others, after the
-state has been conditioned on it. It decides which pairs are possible; the best one-to-one assignment among them is
-taken. Diameters count in the assignment.
+covariance S, are hypotheses. The anchor is the one that agrees with most others, after the state has been conditioned
+on it, or, if it is alone, best with the state. It decides which pairs are possible; the best one-to-one assignment
+among them is taken. Diameters count in the assignment.
 
 A match may be wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs
 that exclude it, and of what the map does not show. The anchor itself, and the pairs that exclude it, have their
@@ -28,6 +28,9 @@ from vtbdrake.components.localization.planar import transform
 
 # Hypotheses that are tried in the association of a scan.
 _HYPOTHESES = 40
+
+# The weight of the d² of a hypothesis itself, beside the d² of each pair that agrees with it.
+_DECIDES = 1e-6
 
 # The density that competes with a first match is the density of all detections times these odds that a detection shows
 # something that is not on the map: assumed, on the safe side for a map that lacks a third of the trees.
@@ -248,16 +251,18 @@ def _compared(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     spread = S[:, None] - K @ C.transpose(0, 1, 3, 2)
     is_itself = np.arange(len(i))[:, None] == tried
     excludes = ((i[:, None] == i[tried]) | (j[:, None] == j[tried])) & ~is_itself
-    squares, own = np.where(excludes, np.inf, squared_distances(rest, spread)), squared_distances(nu, S)
+    squares = np.where(is_itself, 0.0, np.where(excludes, np.inf, squared_distances(rest, spread)))
+    unconditional = squared_distances(nu, S)
     agreement = np.zeros((i.max() + 1, len(tried)))
-    np.maximum.at(agreement, i, np.maximum(threshold - np.where(is_itself, own[:, None], squares), 0.0))
-    anchor = np.argmax(agreement.sum(axis=0))
+    np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
+    # A detection that is alone has nothing that agrees with it: then what fits the state best is the anchor.
+    anchor = np.argmax(agreement.sum(axis=0) - _DECIDES * unconditional[tried])
     is_excluded = excludes[:, anchor]
-    kept = is_itself[:, anchor] | is_excluded
+    is_apart = is_itself[:, anchor] | is_excluded
     conditional, covariances = squares[:, anchor].copy(), spread[:, anchor].copy()
-    agreeing = np.where(kept, np.inf, conditional)[tried]
+    agreeing = np.where(is_apart, np.inf, conditional)[tried]
     partner = np.argmin(agreeing)
     has_partner = agreeing[partner] < threshold
-    conditional[kept] = squares[kept, partner] if has_partner else own[kept]
-    covariances[kept] = spread[kept, partner] if has_partner else S[kept]
+    conditional[is_apart] = squares[is_apart, partner] if has_partner else unconditional[is_apart]
+    covariances[is_apart] = spread[is_apart, partner] if has_partner else S[is_apart]
     return _Comparison(conditional, np.maximum(np.linalg.det(covariances), 1e-12), is_excluded)

@@ -667,9 +667,9 @@ def _stray_odds(S: Array, nu: Array, rivals: Array) -> Array:
     """
     W = np.asarray(np.linalg.inv(S), dtype=float)
     # The innovation of a pair less what the others say of it is W_ii⁻¹ (W ν)_i, with the covariance W_ii⁻¹.
-    own, weighted = _blocks(W), (W @ nu).reshape(-1, 2)
-    squares = np.einsum("ni,nij,nj->n", weighted, np.linalg.inv(own), weighted)
-    odds: Array = rivals * 2.0 * np.pi * np.exp(0.5 * squares) / np.sqrt(np.linalg.det(own))
+    information, weighted = _blocks(W), (W @ nu).reshape(-1, 2)
+    squares = np.einsum("ni,nij,nj->n", weighted, np.linalg.inv(information), weighted)
+    odds: Array = rivals * 2.0 * np.pi * np.exp(0.5 * squares) / np.sqrt(np.linalg.det(information))
     return odds
 
 
