@@ -45,6 +45,13 @@ def test_wrong_law_is_named(law: str, dependence: str) -> None:
     assert reason.startswith(f"the torque of pivot depends on {dependence}")
 
 
+@pytest.mark.parametrize("seed", [210, pytest.param(226, marks=pytest.mark.slow)])
+def test_friction_with_a_memory_is_named_under_a_disturbance(seed: int) -> None:
+    """Which hides it: the term is less than 4 deviations from zero, and a third of the friction."""
+    reasons = calibrated(recorded("Dahl", seed=seed, disturbance=0.1), segment=1.0).reasons
+    assert any("its way since it turned" in reason for reason in reasons), reasons
+
+
 def test_wrong_law_that_is_not_named_widens_the_intervals() -> None:
     """With the sandwich estimator alone, both numbers of the friction lie 3 deviations from the truth."""
     result = calibrated(recorded("Stribeck", seed=24))

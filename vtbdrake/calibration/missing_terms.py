@@ -5,6 +5,10 @@ stay white, and segments that were kept back fit as well. So terms that the mode
 their value zero, beside all parameters that were fitted (a score test; C. R. Rao, Proc. Cambridge Philos. Soc. 44,
 1948): the estimate of a term is one step of Gauss and Newton, its deviation comes from the sandwich estimator.
 
+The disturbance was fitted without the term, and hides a part of it. So friction with a memory is tried once more, by
+the ratio of two likelihoods, without and with it, each with its own likeliest noise: -2 ln of this is chi-square
+distributed with one degree of freedom if there is no such term (Wilks, Annals of Mathematical Statistics 9, 1938).
+
 A term may be too small, or too uncertain, to be named, and still move the fitted parameters by some of their
 deviations. So the most significant one of each joint widens their intervals by what it would change.
 """
@@ -12,7 +16,7 @@ deviations. So the most significant one of each joint widens their intervals by 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +36,16 @@ SHARE_OF_FRICTION = 0.15
 # A term that is this share of a joint's friction, which is then of another law, is missed at fewer deviations, too.
 MOST_OF_FRICTION = 0.4
 SIGNIFICANT_IF_MOST = 3.5
+MEMORY = "its way since it turned (friction with a memory)"
+"""The dependence that is tried by its likelihood ratio, too: a fitted disturbance hides it more than others."""
+# It is tried so if it is this number of deviations from zero, and large enough to be named.
+TRIED_AGAIN = 2.5
+# It is missed if -2 ln of the likelihood ratio exceeds this, as by chance in one of 2,000 terms.
+LIKELY = 12.0
+# Rounds in which parameters and noise are fitted in turn for a likelihood.
+_ROUNDS = 2
+# Directions of the parameters whose singular values are less than this share of the largest are not fitted there.
+_DETERMINED = 1e-6
 # The smallest offset of an encoder that is named, in rad or m.
 LEAST_OFFSET = 2e-3
 # An offset turns gravity by one number, as torques that depend on the position could by several: it comes first.
@@ -63,6 +77,7 @@ class MissingTerm:
         share: The share of the joint's friction that the torque is; NaN of an offset.
         significance: The estimate of the term over its deviation.
         shift: What the scaled parameters would change by with the term, (nz,).
+        ratio: -2 ln of the ratio of the likelihoods without and with the term; 0 if it was not needed.
     """
 
     joint: str
@@ -72,6 +87,7 @@ class MissingTerm:
     share: float
     significance: float
     shift: Array
+    ratio: float = 0.0
 
     @property
     def is_offset(self) -> bool:
@@ -81,9 +97,13 @@ class MissingTerm:
     @property
     def is_named(self) -> bool:
         """Return whether the term is large and sure enough that the model is discrepant without it."""
-        large = self.size > LEAST_OFFSET if self.is_offset else self.share > SHARE_OF_FRICTION
         least = SIGNIFICANT_IF_MOST if self.share > MOST_OF_FRICTION else SIGNIFICANT
-        return large and self.significance > least
+        return self.is_large and (self.significance > least or self.ratio > LIKELY)
+
+    @property
+    def is_large(self) -> bool:
+        """Return whether the term is too large to be left to the disturbance."""
+        return self.size > LEAST_OFFSET if self.is_offset else self.share > SHARE_OF_FRICTION
 
     @property
     def rank(self) -> float:
@@ -157,7 +177,8 @@ def missing_terms(
     distinct = tried - (fitted * info.scales) @ shared
     power, whole = (distinct**2).sum(axis=(0, 1, 2)), (G**2).sum(axis=0)
     gradients = np.einsum("twij,twi->j", distinct, white)
-    suspected = []
+    suspected: list[MissingTerm] = []
+    likeliest: float | None = None
     for k, (joint, dependence, rms, friction, _) in enumerate(terms):
         if power[k] <= _OWN * whole[k]:
             continue
@@ -168,12 +189,36 @@ def missing_terms(
         size, significance = abs(value) * rms, abs(value) / deviation
         share = size / friction
         shift = -value * shared[:, k]
-        if significance > SUSPECTED:
-            term = MissingTerm(
-                joint, dependence, float(size), float(deviation * rms), float(share), float(significance), shift
-            )
+        term = MissingTerm(
+            joint, dependence, float(size), float(deviation * rms), float(share), float(significance), shift
+        )
+        if dependence == MEMORY and significance > TRIED_AGAIN and term.is_large and not term.is_named:
+            if likeliest is None:
+                likeliest = _log_likelihood(segments, linearized, noise)
+            extended = linearized._replace(slopes=np.concatenate([linearized.slopes, columns[..., [k]]], axis=-1))
+            term = replace(term, ratio=2.0 * (_log_likelihood(segments, extended, noise) - likeliest))
+        if significance > SUSPECTED or term.is_named:
             suspected.append(term)
     return sorted(suspected, key=lambda term: -term.rank)
+
+
+def _log_likelihood(segments: Segments, linearized: Linearization, noise: Noise) -> float:
+    """Return the logarithm of the largest likelihood over parameters and noise, but for a constant.
+
+    Args:
+        segments: The recordings, with their filtered trajectories.
+        linearized: The model along these trajectories, whose slopes are by the parameters that are fitted.
+        noise: Where the search of the noise begins.
+    """
+    fitted = linearized
+    for _ in range(_ROUNDS):
+        innovations = segments.innovations(noise, linearized)
+        J = innovations.slopes.reshape(-1, innovations.slopes.shape[-1])
+        scales = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        step = -np.linalg.lstsq(J / scales, innovations.white.ravel(), rcond=_DETERMINED)[0] / scales
+        fitted = linearized._replace(defects=linearized.defects + linearized.slopes @ step)
+        noise = segments.likeliest_noise(fitted, noise)
+    return segments.likelihood(noise, fitted).log
 
 
 def named_terms(terms: Sequence[MissingTerm]) -> list[MissingTerm]:
@@ -217,9 +262,7 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
                 ],
                 "its speed (friction that is not linear in it)": [v * speed],
                 "its load (load_friction of the drives)": [sign * abs(load)],
-                "its way since it turned (friction with a memory)": [
-                    _with_memory(v, segments.period, share * np.ptp(q)) for share in _PRESLIDING
-                ],
+                MEMORY: [_with_memory(v, segments.period, share * np.ptp(q)) for share in _PRESLIDING],
                 "its position": [np.sin(q), np.cos(q), np.sin(2.0 * q), np.cos(2.0 * q)],
             }
             for dependence, torques in shapes.items():
