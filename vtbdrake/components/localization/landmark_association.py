@@ -6,10 +6,10 @@ on it, or, if it is alone, best with the state. It decides which pairs are possi
 among them is taken. Diameters count in the assignment.
 
 A match may be wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs
-that exclude it, and of what the map does not show. The anchor itself, and the pairs that exclude it, have their
-densities given the pair that agrees best with the anchor. The first match of a landmark, which is not in the state yet,
-needs at least 0.8, and d² within a narrower gate, because another landmark may be near on the map. What the map does
-not show lies anywhere, or beside a landmark (``stray_density``): branches, lower parts of a trunk, a second tree.
+that exclude it, and of what the map does not show. The first match of a landmark, which is not in the state yet, needs
+at least 0.8, and d² within a narrower gate, because another landmark may be near on the map. What the map does not show
+lies anywhere, or, with ``stray_density``, beside a landmark: branches, lower parts of a trunk, a second tree. Then the
+anchor may be wrong, too: it and the pairs that exclude it have their densities given the pair that agrees best with it.
 """
 
 from __future__ import annotations
@@ -178,7 +178,8 @@ class Association:
         i, j = np.nonzero(squares < threshold)
         if not len(i):
             return MatchedPairs.none()
-        compared = _compared(i, j, innovations[i, j], covariances[i, j], expected.covariance, threshold)
+        nu, S, doubts = innovations[i, j], covariances[i, j], self.stray_density > 0.0
+        compared = _compared(i, j, nu, S, expected.covariance, threshold, doubts=doubts)
         diameter_cost = self._diameter_cost(detections.select(i), sizes[0][j], sizes[1][j])
         cost = compared.squares + np.log(compared.determinants) + diameter_cost
         gain = np.zeros(squares.shape)
@@ -219,8 +220,9 @@ class Association:
 class _Comparison(NamedTuple):
     """Pairs within the gate, compared after conditioning on the anchor.
 
-    The anchor and the pairs that exclude it are conditioned on the pair that agrees best with it; without one, they
-    keep their own d² and covariances.
+    If the anchor may be wrong, it and the pairs that exclude it are conditioned on the pair that agrees best with it;
+    without one, they keep their own d² and covariances. Otherwise the anchor has a d² of 0, and these pairs an infinite
+    one.
 
     Attributes:
         squares: The d² of the pairs, (k,).
@@ -233,7 +235,9 @@ class _Comparison(NamedTuple):
     is_excluded: NDArray[np.bool_]
 
 
-def _compared(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> _Comparison:
+def _compared(
+    i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float, *, doubts: bool
+) -> _Comparison:
     """Return k pairs, compared.
 
     Args:
@@ -243,6 +247,7 @@ def _compared(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
         S: The covariances of those, (k, 2, 2).
         joint: The covariances of all expected detections with each other, (m, m, 2, 2).
         threshold: The largest d² of pairs that agree.
+        doubts: Whether the anchor may be wrong.
     """
     tried = np.unique(np.linspace(0, len(i) - 1, _HYPOTHESES).astype(int))
     C = joint[j[:, None], j[tried]]
@@ -260,6 +265,9 @@ def _compared(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     is_excluded = excludes[:, anchor]
     is_apart = is_itself[:, anchor] | is_excluded
     conditional, covariances = squares[:, anchor].copy(), spread[:, anchor].copy()
+    if not doubts:
+        covariances[is_apart] = S[is_apart]
+        return _Comparison(conditional, np.maximum(np.linalg.det(covariances), 1e-12), is_excluded)
     agreeing = np.where(is_apart, np.inf, conditional)[tried]
     partner = np.argmin(agreeing)
     has_partner = agreeing[partner] < threshold
