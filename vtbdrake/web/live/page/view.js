@@ -301,17 +301,23 @@ class Page extends Telling {
    */
   async commit(values, before) {
     this.draft = null;
+    // Before the answer: who sees the new value can undo it.
+    if (before) this.#setChanges([...this.changes.slice(1 - UNDOABLE), before]);
     const answer = await this.ask("write", { values, compare: this.compare.checked });
-    if (answer === undefined || !before) return;
-    this.changes = [...this.changes.slice(1 - UNDOABLE), before];
-    this.undoButton.disabled = false;
+    if (answer === undefined && before) this.#setChanges(this.changes.filter((change) => change !== before));
+  }
+
+  /** @param {Record<string, any>[]} changes */
+  #setChanges(changes) {
+    this.changes = changes;
+    this.undoButton.disabled = !changes.length;
   }
 
   // Sets what was changed last to the values that it had before.
   async undo() {
-    const before = this.changes.pop();
-    this.undoButton.disabled = !this.changes.length;
+    const before = this.changes.at(-1);
     if (!before) return;
+    this.#setChanges(this.changes.slice(0, -1));
     const answer = await this.ask("write", { values: before, compare: false });
     if (answer !== undefined) this.say(`${Object.keys(before).join(", ")} as before the change`, "draft");
   }
