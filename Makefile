@@ -52,9 +52,9 @@ demo-control: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
 # In the order of the folders: by default, files of few tests come last, and the longest of them keep one worker busy in the
-# end. One worker more than processors: some tests wait for other processes, for sockets and for the clock. A worker that
+# end. Two workers more than processors: some tests wait for other processes, for sockets and for the clock. A worker that
 # crashes ends the run at once: another one in its place would leave tests out, and wait for ever at the end.
-PYTEST = $(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --max-worker-restart 0 \
+PYTEST = $(RUN) -m pytest --numprocesses $$(($$(nproc) + 2)) --maxprocesses 4 --max-worker-restart 0 \
 	--dist loadfile --no-loadscope-reorder --durations 50 --durations-min 1
 
 test: $(STAMP)
