@@ -126,7 +126,7 @@ class SoilCraterScenario(CraterScenario):
 
     @property
     def yields(self) -> bool:
-        """Whether the soil yields: not with contact at points."""
+        """Return whether the soil yields; with contact at points it does not."""
         return bool(self.plant_config.contact_model != "point")
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:

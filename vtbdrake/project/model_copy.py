@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vtbdrake.project.meshes import CONVERTED, MeshError, can_convert, convert
-from vtbdrake.project.model_faults import elements_read, faults, values
+from vtbdrake.project.model_faults import as_number, elements_read, faults, values
 from vtbdrake.project.xml_text import XmlElement, XmlText
 
 _MODEL_SUFFIXES = "urdf|sdf|xml|obj|mtl|stl|dae|ply|gltf|glb|bin|vtk|png|jpe?g|ktx2|tga|bmp"
@@ -256,10 +256,10 @@ class _Copier:
             inertia = inertial.find("inertia") if inertial is not None else None
             if mass is None or inertia is None:
                 continue
-            m = _number(mass.get("value") or mass.text)
+            m = as_number(mass.get("value") or mass.text)
             moments = [inertia.find(axis) for axis in _AXES]
             values = [e.text if (e := moments[k]) is not None else inertia.get(_AXES[k]) for k in range(3)]
-            if m > 0.0 and all(_number(value) == 0.0 for value in values):
+            if m > 0.0 and all(as_number(value) == 0.0 for value in values):
                 radius = (3.0 * m / (4.0 * math.pi * _DENSITY)) ** (1.0 / 3.0)
                 moment = f"{0.4 * m * radius**2:.3g}"
                 if xml.root.tag == URDF:
@@ -388,15 +388,7 @@ def _with_blanks(text: str) -> str:
 
 
 def _is_zero(text: str) -> bool:
-    return _number(text) == 0.0
-
-
-def _number(text: str) -> float:
-    """Return a number, or NaN where there is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+    return as_number(text) == 0.0
 
 
 def _common_folder(paths: list[Path]) -> Path:

@@ -1,7 +1,8 @@
-"""What is wrong in a model file although Drake reads it, or says in words of its own."""
+"""Faults of model files that Drake reads as something else, or refuses in words of its own."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 
@@ -66,20 +67,20 @@ def _has_no_mass(element: XmlElement) -> Iterator[str]:
         return
     child = inertial.find("mass")
     text = inertial.attributes.get("mass") if child is None else child.attributes.get("value", child.text)
-    if text is not None and not _number(text) >= 0.0:
+    if text is not None and not as_number(text) >= 0.0:
         yield f"the mass of {element.get('name')} is {text.strip()!r}: give a number that is not negative"
 
 
 def _has_no_range(element: XmlElement) -> Iterator[str]:
     if element.tag != "joint":
         return
-    ends = [*map(_number, element.get("range").split())]  # MJCF
+    ends = [*map(as_number, element.get("range").split())]  # MJCF
     for limit in element.iter("limit"):
         lower, upper = (
             limit.get(end) or (child.text if (child := limit.find(end)) is not None else "")
             for end in ("lower", "upper")
         )
-        ends = ends or [_number(lower), _number(upper)]
+        ends = ends or [as_number(lower), as_number(upper)]
     if len(ends) == 2 and ends[0] > ends[1]:
         yield (
             f"the range of {element.get('name') or 'a joint'} is empty, {ends[0]:g} to {ends[1]:g}: give it a lower "
@@ -95,11 +96,12 @@ def _twice(root: XmlElement) -> Iterator[tuple[XmlElement, str]]:
             yield element, f"a second {element.tag} {key[1]}, after the one in line {lines[key]}: rename one of them"
 
 
-def _number(text: str) -> float:
+def as_number(text: str) -> float:
+    """Return a number, or NaN where a text is none."""
     try:
         return float(text)
     except ValueError:
-        return float("nan")
+        return math.nan
 
 
 _CHECKS = (_is_xacro, _has_commas, _has_no_mass, _has_no_range)

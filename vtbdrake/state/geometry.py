@@ -16,7 +16,7 @@ from vtbdrake.state.multibody import FRICTION
 from vtbdrake.state.systems import is_scene_graph, leaves
 
 _REMEMBERED = 8
-"""How many versions are remembered that differ in friction alone."""
+"""The number of versions that are remembered because they differ in friction alone."""
 
 _READERS = {
     Role.kProximity: SceneGraphInspector.GetProximityProperties,

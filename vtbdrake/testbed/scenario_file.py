@@ -193,7 +193,7 @@ def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> S
 
 
 _NUMBER_TAGS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-"""What YAML takes for numbers."""
+"""The tags that YAML gives to numbers."""
 
 _ANOTHER_BASE = re.compile(r"[-+]?(?:(?P<octal>0[0-9_]+$)|[0-9][0-9_]*(?::[0-5]?[0-9])+)")
 """Numbers of YAML 1.1 that mean something else than they look like: 010 is 8, and 1:30 is 90."""

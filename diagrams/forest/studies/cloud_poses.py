@@ -1,4 +1,4 @@
-"""From raw clouds to poses: scans that are cut out of real point clouds, located on the stems of their plots, unguided.
+"""Poses of scans that are cut out of raw real clouds: they are located on the stems of their plots, without a guess.
 
 ``python -m vtbdrake_diagrams.forest.studies.cloud_poses FOLDER`` prints the tables of docs/reality_forest.md. Scans
 and stems come from `vtbdrake_diagrams.forest.reality`, turned and moved. Nothing is chosen by what is printed:
@@ -118,17 +118,17 @@ class Located:
 
     @property
     def error(self) -> float:
-        """The distance from the true place in m."""
+        """Return the distance from the true place in m."""
         return float(np.hypot(*self.delta))
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the pose is sure and wrong."""
+        """Return whether the pose is sure and wrong."""
         return self.fix.is_sure and self.error >= RIGHT
 
     @property
     def refusal(self) -> str:
-        """Why the pose is not sure: the first reason; empty if it is."""
+        """Return the first reason why the pose is not sure; empty if it is."""
         if self.fix.is_sure:
             return ""
         if self.landmarks < FEWEST:
@@ -184,9 +184,7 @@ def chain_row(chain: Chain) -> tuple[str, ...]:
 
 
 def _sure(results: list[Located]) -> str:
-    sure, wrong = (
-        sum(flags) for flags in ([each.fix.is_sure for each in results], [each.is_wrong for each in results])
-    )
+    sure, wrong = sum(each.fix.is_sure for each in results), sum(each.is_wrong for each in results)
     return f"{sure} of {len(results)}, {wrong}"
 
 

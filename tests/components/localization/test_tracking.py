@@ -412,7 +412,7 @@ def two_landmarks(stray_density, deviations):
 
 
 def test_match_that_may_be_a_stray_is_weighed():
-    """As by hand, with a pose that may be displaced in x and y only, and a detection that is one of many strays."""
+    """The mixture is computed by hand: the pose may be displaced in x and y, and one detection of many is a stray."""
     density, deviation, prior, aside = 0.5, 0.05, 0.4, np.array([0.5, -0.3])
     tracker, state, places = two_landmarks(density, [prior, prior, 1e-6])
     after, matches = tracker.update(state, spread_out(places[:1] - aside, deviation))

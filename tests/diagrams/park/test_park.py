@@ -164,7 +164,7 @@ def test_errors_of_real_detections_last_while_the_car_moves_on(drive, half):
 
 @pytest.mark.slow
 def test_density_of_real_detections_beside_trees(drive, half):
-    """As `ParkScenario` assumes; the whole first half: python -m vtbdrake_diagrams.park.few_landmarks."""
+    """The density is about what `ParkScenario` assumes; few_landmarks prints the one of the whole first half."""
     assert 0.005 < stray_density(drive.between(0.0, 200.0), half.mapped, half.scenario.detector) < 0.015
 
 
