@@ -284,18 +284,19 @@ class Guards:
         self._activate(tuple(active))
         if self._leaving:
             self._end_leaving(condition.released)
+        sensed = {**all_sensed, **received}
         causes = self._general_faults(now, condition)
-        causes += self._depart_anew(now, received, all_sensed)
-        causes += self._compare_acting(now, received, all_sensed)
+        causes += self._depart_anew(now, sensed)
+        causes += self._compare_acting(now, sensed)
         commands = self._checked_commands(now, actuation, causes) if condition.error is None else []
         sensor_faults = faults_at(now, self.monitors, received)
         if causes or sensor_faults or self._faults:
             self._note_faults(causes, sensor_faults)
         if self._latched:
-            return GuardDecision(self._fall_back(now, {**all_sensed, **received}, at), False, self._faults)
+            return GuardDecision(self._fall_back(now, sensed, at), False, self._faults)
         actuation = {signal.name: signal.limiter.send(command, at) for signal, command in commands}
         if self._leaving:
-            actuation |= self._fallback_commands(self._leaving, now, {**all_sensed, **received}, at)
+            actuation |= self._fallback_commands(self._leaving, now, sensed, at)
         self._note_commands(now, actuation, self._leaving)
         return GuardDecision(actuation, True, self._faults)
 
@@ -329,8 +330,6 @@ class Guards:
     ) -> GuardDecision:
         """Latch for a reason from outside, whether or not anything is on real; return the verdict of a cycle.
 
-        ``at`` is as in `judge`; ``level`` is the level of the message in Python's ``logging``.
-
         Args:
             reason: The reason, for the log and the verdict.
             now: Present time on the clock of `ReceivedSignal.arrived`, in s.
@@ -338,7 +337,7 @@ class Guards:
             at: The time that the limiters count, in s, as in `judge`.
             level: Level of the message in Python's ``logging``.
         """
-        self._depart_anew(now, received, _NONE)
+        self._depart_anew(now, received)
         fault = Fault(now, None, FaultKind.TOLD, reason)
         self.log.append(fault)
         if not self._latched:
@@ -432,9 +431,7 @@ class Guards:
                 causes.append(Fault(now, signal.name, problem.kind, reason))
         return commands
 
-    def _depart_anew(
-        self, now: float, received: Mapping[str, ReceivedSignal], all_sensed: Mapping[str, ReceivedSignal]
-    ) -> list[Fault]:
+    def _depart_anew(self, now: float, sensed: Mapping[str, ReceivedSignal]) -> list[Fault]:
         """Restart the limiters from the measured values where the machine may have moved; return the faults."""
         pause = 0.0 if self._last is None else now - self._last
         if pause > self._longest_pause:
@@ -448,7 +445,7 @@ class Guards:
                 reason = f"the last {signal.unsent} actuator commands {signal.name} could not be sent"
                 faults.append(Fault(now, signal.name, FaultKind.NOT_SENT, reason))
             if is_stuck or signal.departs:
-                self._restart(signal, now, received, all_sensed)
+                self._restart(signal, now, sensed)
         return faults
 
     def _note_pause(self, pause: float) -> None:
@@ -459,13 +456,7 @@ class Guards:
                 signal.note_pause()
                 self._is_irregular = True
 
-    def _restart(
-        self,
-        signal: GuardedSignal,
-        now: float,
-        received: Mapping[str, ReceivedSignal],
-        all_sensed: Mapping[str, ReceivedSignal],
-    ) -> None:
+    def _restart(self, signal: GuardedSignal, now: float, sensed: Mapping[str, ReceivedSignal]) -> None:
         """Let the next command of a signal whose commands have not left depart from what acts or is measured."""
         sensor = self.measured_by.get(signal.name)
         if sensor is None or not signal.limiter.needs_start or signal.is_withheld:
@@ -475,15 +466,13 @@ class Guards:
         if not begins and not signal.is_position:
             value = signal.reported_value(self.reported.get(signal.name))
         if value is None:
-            value = self._measured_value(sensor, now, received, all_sensed)
+            value = self._measured_value(sensor, now, sensed)
         if value is not None:
             signal.limiter.start_from(value)
         else:
             signal.limiter.release()
 
-    def _compare_acting(
-        self, now: float, received: Mapping[str, ReceivedSignal], all_sensed: Mapping[str, ReceivedSignal]
-    ) -> list[Fault]:
+    def _compare_acting(self, now: float, sensed: Mapping[str, ReceivedSignal]) -> list[Fault]:
         """Compare what the machine reports with what was sent; let commands that it has lost depart from what acts."""
         faults = []
         for name, report in self.reported.items():
@@ -496,32 +485,20 @@ class Guards:
             elif acting.compare(report) and signal in self._active:
                 faults.append(Fault(now, name, FaultKind.NOT_ACTING, signal.not_acting(report)))
             if signal.is_silent or (acting.is_lost and not acting.is_unreported):
-                self._depart_from_acting(signal, now, received, all_sensed)
+                self._depart_from_acting(signal, now, sensed)
         return faults
 
-    def _depart_from_acting(
-        self,
-        signal: GuardedSignal,
-        now: float,
-        received: Mapping[str, ReceivedSignal],
-        all_sensed: Mapping[str, ReceivedSignal],
-    ) -> None:
+    def _depart_from_acting(self, signal: GuardedSignal, now: float, sensed: Mapping[str, ReceivedSignal]) -> None:
         """Let the next command depart from what acts; from the measurement for a position that was never sent."""
         value, sensor = signal.reported_value(self.reported.get(signal.name)), self.measured_by.get(signal.name)
         if signal.is_position and not (signal.acting is not None and signal.acting.is_held):
-            value = None if sensor is None else self._measured_value(sensor, now, received, all_sensed)
+            value = None if sensor is None else self._measured_value(sensor, now, sensed)
         if value is not None and not signal.is_withheld and signal.limiter.has_start:
             signal.limiter.start_from(value)
 
-    def _measured_value(
-        self,
-        sensor: str,
-        now: float,
-        received: Mapping[str, ReceivedSignal],
-        all_sensed: Mapping[str, ReceivedSignal],
-    ) -> Any:
+    def _measured_value(self, sensor: str, now: float, sensed: Mapping[str, ReceivedSignal]) -> Any:
         """Return the value of a sensor signal that can be relied on; None if it cannot."""
-        measured = received.get(sensor) or all_sensed.get(sensor)
+        measured = sensed.get(sensor)
         if measured is None or self.monitors[sensor].fault_at(now, measured) is not None:
             return None
         return measured.value
@@ -549,14 +526,14 @@ class Guards:
     def fall_back(self, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> dict[str, Any]:
         """Return the commands of the fallbacks, within the limits, for all signals that are on real or leave it.
 
-        See `judge` for the arguments; it does the same while a fault is latched.
+        `judge` does the same while a fault is latched.
 
         Args:
             now: Present time on the clock of `ReceivedSignal.arrived`, in s.
             received: The sensor signals that are on real, by name.
             at: The time that the limiters count, in s, as in `judge`.
         """
-        self._compare_acting(now, received, _NONE)
+        self._compare_acting(now, received)
         return self._fall_back(now, received, at)
 
     def _fall_back(self, now: float, received: Mapping[str, ReceivedSignal], at: float) -> dict[str, Any]:
