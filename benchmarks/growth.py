@@ -26,7 +26,8 @@ from vtbdrake.optimization import Parameter, Problem, Study, Sweep
 from vtbdrake.optimization.pareto import undominated
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
-from vtbdrake.recording.replay import RewindableReplay, replay
+from vtbdrake.recording.replay import replay
+from vtbdrake.recording.rewindable_replay import RewindableReplay
 from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutTask, SerialExecutor
 from vtbdrake.rollout.executor import Parameters, run_rollouts
 from vtbdrake.testbed import Interface, Scenario, Signal

@@ -14,7 +14,7 @@ from vtbdrake.recording.kept_states import KeptStates
 from vtbdrake.recording.log_format import installed_versions
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
-from vtbdrake.recording.replay import RewindableReplay
+from vtbdrake.recording.rewindable_replay import RewindableReplay
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import VirtualTestbed
 

@@ -1,4 +1,4 @@
-"""The types of arrays of floats and of indices, and immutable values that hold arrays."""
+"""The types of arrays of floats and of indices, immutable values that hold arrays, and small functions of arrays."""
 
 from __future__ import annotations
 
@@ -53,6 +53,11 @@ def set_read_only(value: Any, **arrays: NDArray[Any]) -> None:
     for name, array in arrays.items():
         array.flags.writeable = False
         object.__setattr__(value, name, array)
+
+
+def stacked(values: list[Any]) -> Any:
+    """Return numbers, or arrays of one shape, as one array; other values as the list that they are."""
+    return np.array(values) if all(isinstance(value, float | np.ndarray) for value in values) else values
 
 
 def _own_arrays(value: Any, is_of_floats: Mapping[str, bool]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vtbdrake.common.closing import Closing
-from vtbdrake.recording.replay import KEPT_WORK, RewindableReplay
+from vtbdrake.recording.rewindable_replay import KEPT_WORK, RewindableReplay
 from vtbdrake.testbed.switch import Position
 
 if TYPE_CHECKING:

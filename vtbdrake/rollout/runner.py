@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.arrays import stacked
 from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.drake_workarounds.making import making
@@ -510,7 +511,7 @@ class _Samples:
             parameters,
             np.array(self._times),
             [np.array(samples) for samples in self._samples],
-            {address: _stack(values) for address, values in self._record.items()},
+            {address: stacked(values) for address, values in self._record.items()},
             end=end,
             message=message,
             reachable=None if self._prospect is None else self._prospect.reachable,
@@ -602,10 +603,6 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
         if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
             raise
         raise SimulationError(f"a variable of a {measure.role} is not finite: {error}") from error
-
-
-def _stack(values: list[Any]) -> Any:
-    return np.array(values) if all(isinstance(value, float | np.ndarray) for value in values) else values
 
 
 def values_key(values: Mapping[str, Any]) -> Hashable:

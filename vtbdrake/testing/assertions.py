@@ -19,8 +19,8 @@ from vtbdrake.control.statistics import QUANTITIES, LoopStatistics
 from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.control.switching import checked_continuity
 from vtbdrake.machine import MachineStatistics
+from vtbdrake.recording.cycle_replay import Target
 from vtbdrake.recording.log_reader import ControlLog, read_log
-from vtbdrake.recording.replay import Target
 from vtbdrake.recording.replay import replay as replay_log
 from vtbdrake.testbed import Signal
 from vtbdrake.testbed.switch import Position
