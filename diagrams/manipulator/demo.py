@@ -15,6 +15,7 @@ import click
 import numpy as np
 
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import rms
 from vtbdrake.common.child_process import ChildProcess
 from vtbdrake.control import RealTime, Runtime, SimulatedClock, SwitchRefusedError
 from vtbdrake.control.stepping import Cycle
@@ -32,7 +33,6 @@ from vtbdrake_diagrams.manipulator.studies.trials import (
     FREE,
     LawAlongX,
     Track,
-    rms,
     run_trial,
     trial_scenario,
 )

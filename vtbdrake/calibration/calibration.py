@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import inf, nan
+from math import inf
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -24,7 +24,7 @@ from vtbdrake.calibration.log_checks import check_log, check_torques, currents
 from vtbdrake.calibration.missing_terms import lost_friction, missing_terms, named_terms, widening
 from vtbdrake.calibration.posterior import sandwich_covariance, torque_disturbances
 from vtbdrake.common.argument_checks import counted
-from vtbdrake.common.arrays import Array
+from vtbdrake.common.arrays import Array, rms
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import GAP, Log
 from vtbdrake.rollout.executor import watched
@@ -509,7 +509,7 @@ def _result(
     model, segments, used = prepared.model, prepared.segments, ~held_back
     linearized = segments.linearized(z)
     white = (innovations := segments.innovations(noise, linearized)).white
-    fit, holdout = _rms(white[:, used]), _rms(white[:, held_back])
+    fit, holdout = rms(white[:, used]), rms(white[:, held_back])
     J = innovations.slopes[:, used].reshape(-1, len(z))
     info = information_of(J, model.names, model.scales)
     _check_told(model, info)
@@ -614,14 +614,8 @@ def _is_worse(white: Array, used: NDArray[np.bool]) -> bool:
     if used.all():
         return False
     parts = white[:, ~used], white[:, used]
-    means, large = (
-        [measure(part) for part in parts] for measure in (_rms, lambda part: np.quantile(abs(part), _LARGE))
-    )
+    means, large = ([measure(part) for part in parts] for measure in (rms, lambda part: np.quantile(abs(part), _LARGE)))
     return bool(means[0] > WORSE * means[1] and large[0] > WORSE * large[1])
-
-
-def _rms(white: Array) -> float:
-    return float(np.sqrt(np.mean(white**2))) if white.size else nan
 
 
 def _start_is_as_good(segments: Segments, noise: Noise, white: Array, held_back: NDArray[np.bool]) -> bool:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from vtbdrake.calibration.filtering import Linearization, Noise, Segments
 from vtbdrake.calibration.fisher import Information
 from vtbdrake.calibration.posterior import block_scores
-from vtbdrake.common.arrays import Array
+from vtbdrake.common.arrays import Array, rms
 
 # A term is missed if it is at least this number of deviations from zero.
 SIGNIFICANT = 6.0
@@ -141,7 +141,7 @@ def lost_friction(segments: Segments, start: Array, z: Array, noise: Noise, devi
     for j, name in enumerate(model.joint_names):
         varied = [k for k in model.friction_parameters if model.names[k].endswith(f"[{model.actuator_of[j]}]")]
         departed = max((abs(z[k] - start[k]) / max(deviations[k], 1e-300) for k in varied), default=0.0)
-        first, last = _rms(before[..., j]), _rms(after[..., j])
+        first, last = rms(before[..., j]), rms(after[..., j])
         disturbance = float(noise.torque[j])
         if departed > SIGNIFICANT and last < _LOST * first and disturbance > last:
             reasons.append(
@@ -179,18 +179,18 @@ def missing_terms(
     gradients = np.einsum("twij,twi->j", distinct, white)
     suspected: list[MissingTerm] = []
     likeliest: float | None = None
-    for k, (joint, dependence, rms, friction, _) in enumerate(terms):
+    for k, (joint, dependence, torque, friction, _) in enumerate(terms):
         if power[k] <= _OWN * whole[k]:
             continue
         value = -gradients[k] / power[k]
         # Scores without the term come from a wrong model.
         scores = block_scores(distinct[..., [k]], white + value * distinct[..., k], segments.period)
         deviation = max(np.sqrt((scores**2).sum()), _LEAST_DEVIATION * np.sqrt(power[k])) / power[k]
-        size, significance = abs(value) * rms, abs(value) / deviation
+        size, significance = abs(value) * torque, abs(value) / deviation
         share = size / friction
         shift = -value * shared[:, k]
         term = MissingTerm(
-            joint, dependence, float(size), float(deviation * rms), float(share), float(significance), shift
+            joint, dependence, float(size), float(deviation * torque), float(share), float(significance), shift
         )
         if dependence == MEMORY and significance > TRIED_AGAIN and term.is_large and not term.is_named:
             if likeliest is None:
@@ -252,8 +252,8 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
     for j, name in enumerate(model.joint_names):
         q, v, load = x[..., j], x[..., n + j], motor[..., j]
         sign, speed = np.sign(v), abs(v)
-        rms = _rms(friction[..., j]) or _rms(load)
-        if rms > 0.0:
+        size = rms(friction[..., j]) or rms(load)
+        if size > 0.0:
             shapes = {
                 "the direction of its motion (asymmetry of the drives)": [np.ones_like(v), sign],
                 "its speed near rest (stribeck of the drives)": [
@@ -267,7 +267,7 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
             }
             for dependence, torques in shapes.items():
                 for torque in torques:
-                    yield name, dependence, _rms(torque), rms, linearized.B[..., j] * torque[..., np.newaxis]
+                    yield name, dependence, rms(torque), size, linearized.B[..., j] * torque[..., np.newaxis]
         unit = np.zeros(2 * n)
         unit[j] = 1.0
         # The model at q + offset, and back: what the positions become differs from the measured ones by the offset.
@@ -289,7 +289,3 @@ def _with_memory(v: Array, period: float, angle: float) -> Array:
     for k in range(1, len(v)):
         friction[k] = sign[k - 1] + (friction[k - 1] - sign[k - 1]) * stays[k - 1]
     return friction
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -58,6 +58,12 @@ def set_read_only(value: Any, **arrays: NDArray[Any]) -> None:
 def stacked(values: list[Any]) -> Any:
     """Return numbers, or arrays of one shape, as one array; other values as the list that they are."""
     return np.array(values) if all(isinstance(value, float | np.ndarray) for value in values) else values
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of some values; NaN of none."""
+    squares = np.square(np.asarray(values, dtype=float))
+    return float(np.sqrt(squares.mean())) if squares.size else np.nan
 
 
 def _own_arrays(value: Any, is_of_floats: Mapping[str, bool]) -> None:

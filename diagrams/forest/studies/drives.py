@@ -24,14 +24,14 @@ from typing import Any, Self, TypeVar
 
 import click
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
-from vtbdrake.common.arrays import Array
+from vtbdrake.common.arrays import Array, rms
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, TRACKING, Localization, LocalizationUnit, UnitState, Views
@@ -480,12 +480,6 @@ def against_best(
     return BestError(
         float(np.sqrt(least / count)), float(np.sqrt(on_maps / count)), float(np.sqrt(unit / on_maps)), (low, high)
     )
-
-
-def rms(values: ArrayLike) -> float:
-    """Return the root mean square of some values; NaN of none."""
-    squares = np.square(np.asarray(values, dtype=float))
-    return float(np.sqrt(squares.mean())) if squares.size else np.nan
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import rms
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake_diagrams.forest.scenario import CARRIERS, ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import (
@@ -39,7 +40,6 @@ from vtbdrake_diagrams.forest.studies.drives import (
     localize,
     nees_bounds,
     recorded_drive,
-    rms,
 )
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import add_results, read_results

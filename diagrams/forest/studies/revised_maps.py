@@ -36,7 +36,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
-from vtbdrake.common.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices, rms
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse
@@ -52,7 +52,6 @@ from vtbdrake_diagrams.forest.studies.drives import (
     memories,
     nees_bounds,
     recorded_drive,
-    rms,
     simulated_drive,
     track_of,
 )

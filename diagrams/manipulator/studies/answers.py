@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.arrays import rms
 from vtbdrake.control import Runtime, SimulatedClock
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.lcm.hub import Hub
@@ -27,7 +28,6 @@ from vtbdrake_diagrams.manipulator.studies.trials import (
     RestingForce,
     Track,
     Trial,
-    rms,
     run_trial,
     trial_scenario,
 )

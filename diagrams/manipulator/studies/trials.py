@@ -10,6 +10,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.common.arrays import rms
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
@@ -268,11 +269,6 @@ class Contact:
 
     def _index(self, clock: float) -> int:
         return int(np.abs(self.clock - clock).argmin())
-
-
-def rms(values: NDArray[np.float64]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def run_trial(runtime: Runtime, motions: Sequence[int] = PROGRAM, *, limit: float = 60.0) -> Track:
