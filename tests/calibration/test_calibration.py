@@ -20,7 +20,7 @@ from vtbdrake.calibration import (
     calibrate,
     information,
 )
-from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.calibration_result import Verdict
 from vtbdrake.calibration.filtering import Noise, Segments
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, Series

@@ -9,7 +9,7 @@ import scipy
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, TRUTH, VALUES, VISCOUS, calibrated
 from vtbdrake.calibration import JointModel, JointRecording, Noise, calibrate, information
-from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.calibration_result import Verdict
 from vtbdrake.calibration.filtering import Likelihood, Segments
 from vtbdrake.calibration.fisher import information_of
 from vtbdrake.calibration.inverse_dynamics import directions_of

@@ -8,8 +8,9 @@ import pytest
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from vtbdrake.calibration import CalibrationError, Inertia, JointModel
-from vtbdrake.calibration.filtering import JointRecording, Noise
+from vtbdrake.calibration.filtering import Noise
 from vtbdrake.calibration.joint_model import log_cholesky
+from vtbdrake.calibration.joint_recording import JointRecording
 from vtbdrake.optimization import Parameter
 from vtbdrake.testbed.inertia import inertia_of
 

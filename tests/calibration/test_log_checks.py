@@ -12,7 +12,7 @@ import pytest
 from tests.calibration.pendulum import DRIVES, PERIOD, PendulumScenario, recorded
 from tests.calibration.test_calibration import COULOMB, PARAMETERS, TRUTH, VALUES, calibrated
 from vtbdrake.calibration import Calibration, CalibrationError, JointModel, JointRecording, calibrate, information
-from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.calibration_result import Verdict
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics
 from vtbdrake.calibration.log_checks import check_log, check_torques, currents
 from vtbdrake.optimization import Parameter

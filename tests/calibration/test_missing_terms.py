@@ -11,7 +11,7 @@ from tests.calibration import light_joint
 from tests.calibration.pendulum import DRIVES
 from tests.calibration.plain_pendulum import commanded, recorded
 from tests.calibration.test_calibration import COULOMB, PARAMETERS, VALUES, VISCOUS, calibrated
-from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.calibration_result import Verdict
 from vtbdrake.optimization import Parameter
 
 pytestmark = pytest.mark.one_python

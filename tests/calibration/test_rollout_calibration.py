@@ -12,7 +12,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import brentq
 
 from vtbdrake.calibration import CalibrationError, RolloutCalibration, Window, calibrate_by_rollouts
-from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.calibration_result import Verdict
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Parameter
 from vtbdrake.testbed import ScenarioError

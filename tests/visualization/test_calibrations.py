@@ -10,7 +10,7 @@ import pytest
 
 from tests.calibration.pendulum import PendulumScenario
 from vtbdrake.calibration import Calibration
-from vtbdrake.calibration.calibration import Calibrated, Verdict
+from vtbdrake.calibration.calibration_result import Calibrated, Verdict
 from vtbdrake.calibration.fit_curves import FitCurves
 
 pytestmark = pytest.mark.one_python

@@ -1,29 +1,29 @@
 """The public names of calibration and validation."""
 
-from .calibration import Calibration as Calibration
 from .calibration import calibrate as calibrate
 from .calibration import information as information
+from .calibration_result import Calibration as Calibration
 from .excitation_design import Excitation as Excitation
 from .excitation_design import excitation as excitation
-from .filtering import JointRecording as JointRecording
 from .filtering import Noise as Noise
 from .fisher import Information as Information
 from .joint_model import CalibrationError as CalibrationError
 from .joint_model import Inertia as Inertia
 from .joint_model import JointModel as JointModel
+from .joint_recording import JointRecording as JointRecording
 from .refit import ModelRefit as ModelRefit
 from .refit import Refit as Refit
-from .regression import DriveModel as DriveModel
 from .regression import Regression as Regression
 from .regression import RegressionEquations as RegressionEquations
-from .regression import TorqueRegressor as TorqueRegressor
-from .regression import base_parameters as base_parameters
 from .regression import equations as equations
-from .regression import friction as friction
 from .regression import regress as regress
 from .rollout_calibration import RolloutCalibration as RolloutCalibration
 from .rollout_calibration import Window as Window
 from .rollout_calibration import calibrate_by_rollouts as calibrate_by_rollouts
+from .torque_regressor import DriveModel as DriveModel
+from .torque_regressor import TorqueRegressor as TorqueRegressor
+from .torque_regressor import base_parameters as base_parameters
+from .torque_regressor import friction as friction
 from .trials import SelfTest as SelfTest
 from .trials import SelfTestTrial as SelfTestTrial
 from .trials import machine_log as machine_log

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.calibration.filtering import JointRecording, Segments
+from vtbdrake.calibration.filtering import Segments
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics
+from vtbdrake.calibration.joint_recording import JointRecording
 from vtbdrake.common.arrays import Array
 
 # About the largest number of points of a curve.

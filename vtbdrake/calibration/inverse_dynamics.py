@@ -9,8 +9,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.calibration.filtering import JointRecording
 from vtbdrake.calibration.joint_model import JointModel, at_samples
+from vtbdrake.calibration.joint_recording import JointRecording
 from vtbdrake.common.arrays import Array
 
 # A direction in which the recordings leave more than this, in units of the parameters' scales, is not determined.

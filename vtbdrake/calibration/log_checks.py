@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.calibration.filtering import JointRecording, stale
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
 from vtbdrake.calibration.joint_model import CalibrationError, JointModel
+from vtbdrake.calibration.joint_recording import JointRecording, stale
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.common.suggestions import did_you_mean

@@ -9,7 +9,8 @@ from math import inf
 from time import process_time
 from typing import Any
 
-from vtbdrake.calibration.calibration import Calibration, calibrate
+from vtbdrake.calibration.calibration import calibrate
+from vtbdrake.calibration.calibration_result import Calibration
 from vtbdrake.common.argument_checks import as_number
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.closing import Closing

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.calibration.calibration import (
+from vtbdrake.calibration.calibration_result import (
     WORSE,
     Calibrated,
     Calibration,

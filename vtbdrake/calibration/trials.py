@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.calibration.calibration import Calibration, Verdict, calibrate
+from vtbdrake.calibration.calibration import calibrate
+from vtbdrake.calibration.calibration_result import Calibration, Verdict
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, body_numbers
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.interrupt import interrupt_taken

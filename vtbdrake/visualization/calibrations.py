@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vtbdrake.calibration.calibration import Calibration
+from vtbdrake.calibration.calibration_result import Calibration
 from vtbdrake.calibration.fit_curves import FitCurves
 from vtbdrake.common.summary_html import image_html
 from vtbdrake.visualization.plots import Picture, finish
