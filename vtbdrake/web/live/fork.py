@@ -80,8 +80,8 @@ class Simulation:
         return self._testbed.fork(self._simulator)
 
 
-class Fork:
-    """A copy of the simulation of a testbed, from a snapshot on.
+class Fork(Simulation):
+    """A copy of the simulation of a testbed, from a snapshot on, that may fail.
 
     Args:
         testbed: The testbed; the fork has a context of its own.
@@ -89,7 +89,6 @@ class Fork:
         values: Variables that are set first, by address.
 
     Attributes:
-        context: The context of the fork.
         failure: Why its simulation has ended; empty while it goes on.
 
     Raises:
@@ -99,26 +98,15 @@ class Fork:
     def __init__(
         self, testbed: VirtualTestbed, snapshot: Snapshot, values: Mapping[str, ArrayLike] | None = None
     ) -> None:
-        self._simulation = Simulation(testbed, snapshot, values)
-        self.context: Context = self._simulation.context
+        super().__init__(testbed, snapshot, values)
         self.failure = ""
-
-    @property
-    def world(self) -> Context:
-        """Return the context whose world is drawn."""
-        return self.context
-
-    @property
-    def time(self) -> float:
-        """Return the time of the fork, in seconds."""
-        return float(self.context.get_time())
 
     def advance_to(self, time: float) -> None:
         """Simulate until ``time``; a simulation that fails stays where it stands, and `failure` tells why."""
         if self.failure or time <= self.time:
             return
         try:
-            self._simulation.advance_to(time)
+            super().advance_to(time)
         except FAILURES as error:
             self.failure = one_line(error)
 
