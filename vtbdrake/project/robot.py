@@ -136,6 +136,11 @@ class ProjectRobot:
         for name in self.servos:
             replace_servo(plant, name)
 
+    def add_drives(self, plant: MultibodyPlant) -> None:
+        """Add an actuator to each of the `added_drives`, in a plant with the changes of `change`."""
+        for name in self.added_drives:
+            plant.AddJointActuator(name, plant.GetJointByName(name))
+
 
 def replace_servo(plant: MultibodyPlant, name: str) -> None:
     """Replace an actuator that has a controller by one that takes a torque or force, with the same rotor.

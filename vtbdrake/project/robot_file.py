@@ -199,8 +199,7 @@ class _RobotReader:
         """Return the plant of the project's world: as the file has it, with the changes that ``robot`` lists."""
         plant, scene_graph, builder = self._parser.load()
         robot.change(plant)
-        for name in robot.added_drives:
-            plant.AddJointActuator(name, plant.GetJointByName(name))
+        robot.add_drives(plant)
         drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         robot.driven = tuple(drive.joint().name() for drive in drives)
         robot.has_constraints = plant.num_constraints() > 0
@@ -232,8 +231,7 @@ class _RobotReader:
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         self._parser.parse(plant)
         robot.change(plant)
-        for name in robot.added_drives:
-            plant.AddJointActuator(name, plant.GetJointByName(name))
+        robot.add_drives(plant)
         self._parser.finalize(plant)
         index_of = {joint.name: k for k, joint in enumerate(robot.joints)}
         velocities = []

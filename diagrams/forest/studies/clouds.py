@@ -181,11 +181,6 @@ def rings(cloud: Cloud, *, arc: float = FULL, fewest: int = 15, seed: int = 0) -
     return np.array(stems).reshape(-1, 3)
 
 
-def border_of(stems: Array) -> float:
-    """Return the x that halves the stems of a cloud (k, 3): the detector's weights are fitted to those below it."""
-    return float(np.median(stems[:, 0]))
-
-
 def _rings_of_slice(cloud: Cloud, height: float, arc: float, fewest: int, rng: np.random.Generator) -> Array:
     """Return x, y, radius, the height and the number of points of the rings in a slice, (k, 5)."""
     places = cloud.points[np.abs(cloud.heights - height) < 0.5 * _SLICE, :2]

@@ -282,10 +282,6 @@ def report(ways: Ways, variants: Sequence[str] = CARRIERS) -> str:
     return f"{table(header, rows)}\n{len(ways)} forests"
 
 
-def _word(is_true: bool) -> str:
-    return "holds" if is_true else "does NOT hold"
-
-
 def in_words(ways: Ways) -> str:
     """Return how the unit does on foot, in a few sentences."""
     parts = []
@@ -334,7 +330,7 @@ def main(forests: int, workers: int) -> None:
     command = "python -m vtbdrake_diagrams.forest.studies.on_foot"
     add_results(FILE, results, range(SEED, SEED + forests), walked, command=command, workers=workers)
     print(report(results))
-    print(f"on foot: {_word(holds(results))}")
+    print(f"on foot: {'holds' if holds(results) else 'does NOT hold'}")
 
 
 if __name__ == "__main__":
