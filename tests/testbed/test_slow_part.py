@@ -15,7 +15,7 @@ from vtbdrake.state import Codec, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.testbed import SlowPart, slow_parts
-from vtbdrake.testbed.slow_part import SlowPartError
+from vtbdrake.testbed.slow_function import SlowPartError
 
 PERIOD = 0.05
 STEP = 0.01

@@ -18,7 +18,8 @@ from vtbdrake.control.clock import Clock, Throttle
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.control.supervisor import SupervisorMessage, supervise
-from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
+from vtbdrake.testbed.slow_function import Arrays, split_memory
+from vtbdrake.testbed.slow_part import SlowPart
 
 _log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from vtbdrake.reasoning.reasoner import Reasoner, SearchConfig
 from vtbdrake.state import Quantity
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
-from vtbdrake.testbed.slow_part import SlowFunction
+from vtbdrake.testbed.slow_function import SlowFunction
 
 if TYPE_CHECKING:
     from vtbdrake.compiled.equations import Equations

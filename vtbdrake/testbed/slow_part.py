@@ -4,238 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from math import ceil, inf
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, EventStatus, InputPort, State
 
-from vtbdrake.common.arrays import immutable
 from vtbdrake.drake_workarounds.event_times import SAMPLED_EARLY, SHOWN_EARLY
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.declarations import weakly
 from vtbdrake.state.systems import leaves
 from vtbdrake.testbed.dps_state import DPS_STATE_CODEC, DpsReader, RootReference
-
-Arrays = Mapping[str, np.ndarray]
-
-MEMORY = "memory"
-T = TypeVar("T")
-
-
-class SlowPartError(ValueError):
-    """A result of a slow part does not match its declaration."""
-
-
-@dataclass(frozen=True)
-class SlowFunction:
-    """A slow part's function with the codecs that turn its arguments and results into arrays.
-
-    The arrays of a value are named ``<name>`` or, where its codec makes several, ``<name>.<part>``.
-
-    Attributes:
-        function: The user's function, see `SlowPart`.
-        inputs, outputs: The codecs, by port.
-        memory: The codec of the memory, under its name; empty if there is none.
-        makes: The names of all arrays of a result.
-    """
-
-    function: Callable[..., Any]
-    inputs: Mapping[str, Codec]
-    outputs: Mapping[str, Codec]
-    memory: Mapping[str, Codec]
-    makes: frozenset[str]
-
-    def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
-        """Return the arrays of the outputs and the memory, for the arrays of the inputs and the memory.
-
-        If the function returns None for the outputs, there is no result, and no arrays of outputs.
-
-        Raises:
-            SlowPartError: The function did not return the declared outputs.
-            Exception: Any exception of the function.
-        """
-        codecs = {**self.inputs, **self.memory}
-        result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
-        if result is None:
-            return {}
-        remembered = {}
-        if self.memory:
-            if not (isinstance(result, tuple) and len(result) == 2):
-                raise SlowPartError(f"a slow part with a memory returns (outputs, memory), not {result!r}")
-            result, memory = result
-            remembered = encode({MEMORY: memory}, self.memory)
-            if result is None:
-                return remembered
-        made = encode(self._by_name(result), self.outputs) | remembered
-        if made.keys() != self.makes:
-            raise SlowPartError(
-                f"a result's codecs make the arrays {', '.join(sorted(self.makes))} at first, and now {', '.join(made)}"
-            )
-        return made
-
-    def prepare(self) -> None:
-        """Call the method ``prepare`` of the user's function, if it has one."""
-        prepare = getattr(self.function, "prepare", None)
-        if prepare is not None:
-            prepare()
-
-    def _by_name(self, outputs: Any) -> Mapping[str, Any]:
-        if not isinstance(outputs, Mapping) and len(self.outputs) == 1:
-            return dict.fromkeys(self.outputs, outputs)
-        if not isinstance(outputs, Mapping) or set(outputs) != set(self.outputs):
-            returned = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else repr(outputs)
-            raise SlowPartError(f"a slow part returns its outputs by name ({', '.join(self.outputs)}), not {returned}")
-        return outputs
-
-
-def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, np.ndarray]:
-    """Return the values as read-only arrays of their own.
-
-    Args:
-        values: The values by name; every codec needs one.
-        codecs: The codec of each value, by its name.
-
-    Raises:
-        SlowPartError: A value is not of its codec's type.
-    """
-    arrays = {}
-    for name, codec in codecs.items():
-        try:
-            parts = codec.encode(values[name])
-        except (ValueError, TypeError, AttributeError) as error:
-            raise SlowPartError(f"{name}: {error}") from error
-        for part, value in parts.items():
-            arrays[f"{name}.{part}" if part else name] = _read_only_copy(value)
-    return arrays
-
-
-def read_only(arrays: Arrays) -> dict[str, np.ndarray]:
-    """Return the arrays as `encode` makes them; read-only ones are not copied."""
-    return {name: _read_only_copy(array) if array.flags.writeable else array for name, array in arrays.items()}
-
-
-def _read_only_copy(value: np.ndarray) -> np.ndarray:
-    array = np.array(value)
-    array.flags.writeable = False
-    return array
-
-
-def decode(arrays: Arrays, name: str, codec: Codec) -> Any:
-    """Return one of the values that the arrays hold.
-
-    Args:
-        arrays: The arrays by ``name`` or ``name.part``, as `encode` returns them.
-        name: The name of the value.
-        codec: The codec of the value.
-    """
-    return codec.decode(parts_of(arrays, name))
-
-
-def parts_of(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
-    """Return the arrays of one value, by part; empty if it is not there.
-
-    Args:
-        arrays: The arrays by ``name`` or ``name.part``, as `encode` returns them.
-        name: The name of the value.
-    """
-    prefix = f"{name}."
-    parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
-    return {"": arrays[name]} if name in arrays else parts
-
-
-def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
-    """Return the arrays of the memory and the arrays of the outputs in a result."""
-    memory = {name: array for name, array in arrays.items() if name.partition(".")[0] == MEMORY}
-    return memory, {name: array for name, array in arrays.items() if name not in memory}
-
-
-class WorkStatus(IntEnum):
-    """The status of one sample."""
-
-    WAITING = 0
-    DONE = 1
-    MISSING = 2
-
-
-@dataclass(frozen=True)
-class Work:
-    """The state of one sample.
-
-    Attributes:
-        tick: Number of the sample.
-        status: Whether its result is there.
-        arrays: Arrays of the inputs while the sample waits, of the outputs when it is done.
-    """
-
-    tick: int
-    status: WorkStatus
-    arrays: Arrays
-
-
-@immutable
-class Progress:
-    """The samples, results and memory of a slow part: immutable, and so shared by all copies of a context.
-
-    Attributes:
-        shown: The arrays of the abstract outputs.
-        memory: The arrays of the memory.
-        under_way: The samples whose results are not due yet, in order.
-    """
-
-    shown: Arrays
-    memory: Arrays
-    under_way: tuple[Work, ...] = ()
-
-    def find(self, tick: int) -> Work | None:
-        """Return the work on sample number ``tick``, or None if it is not under way."""
-        return next((work for work in self.under_way if work.tick == tick), None)
-
-    def having(self, tick: int, arrays: Arrays) -> Progress:
-        """Return the progress with the result of sample number ``tick``.
-
-        The memory of the result is always used, its outputs only if they are awaited. A result without outputs is
-        missing.
-
-        Args:
-            tick: The number of the sample.
-            arrays: The arrays of the result: its outputs, and its memory, if it has one.
-        """
-        memory, outputs = split_memory(arrays)
-        result = Work(tick, WorkStatus.DONE if outputs else WorkStatus.MISSING, outputs)
-        awaited = (work.tick == tick and work.status == WorkStatus.WAITING for work in self.under_way)
-        under_way = tuple(result if due else work for work, due in zip(self.under_way, awaited, strict=True))
-        return replace(self, memory=memory or self.memory, under_way=under_way)
-
-    def after(self, work: Work, shown: Arrays) -> Progress:
-        """Return the progress after ``work`` was due, with the arrays that are shown now.
-
-        Args:
-            work: The sample whose result was due; it and all earlier ones are under way no more.
-            shown: The arrays of the abstract outputs from now on.
-        """
-        return replace(self, shown=shown, under_way=tuple(w for w in self.under_way if w.tick > work.tick))
-
-
-def _encode(progress: Progress) -> dict[str, np.ndarray]:
-    ticks = [(work.tick, work.status) for work in progress.under_way]
-    groups = {"shown": progress.shown, MEMORY: progress.memory}
-    groups |= {f"under_way.{work.tick}": work.arrays for work in progress.under_way}
-    arrays = {f"{group}.{name}": array for group, members in groups.items() for name, array in members.items()}
-    return {"ticks": np.array(ticks, dtype=np.int64).reshape(-1, 2), **arrays}
-
-
-def _decode(arrays: Arrays) -> Progress:
-    under_way = [Work(int(t), WorkStatus(status), parts_of(arrays, f"under_way.{t}")) for t, status in arrays["ticks"]]
-    return Progress(parts_of(arrays, "shown"), parts_of(arrays, MEMORY), tuple(under_way))
-
-
-PROGRESS_CODEC = Codec(_encode, _decode)
-
+from vtbdrake.testbed.slow_function import (
+    MEMORY,
+    Arrays,
+    SlowFunction,
+    SlowPartError,
+    decode,
+    encode,
+    read_only,
+    split_memory,
+)
+from vtbdrake.testbed.slow_progress import PROGRESS_CODEC, Progress, Work, WorkStatus
 
 MOST_UNDER_WAY = 16
 _SHORTEST = 1e-6  # s
