@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import Context
 
-from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
-from vtbdrake.compiled import compiled_rollouts as rollouts
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError, program
 from vtbdrake.compiled.compiled_rollouts import CompiledBatch
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutTask, SerialExecutor
@@ -148,10 +147,10 @@ def test_long_rollouts_are_made_in_smaller_groups(monkeypatch: pytest.MonkeyPatc
     options = {"parameters": [seed], "outputs": [measured], "check": False}
     values = {seed: np.array([7.0, 8.0, 7.0, 9.0, 10.0])}
     sizes = []
-    buffers = rollouts.Buffers
-    monkeypatch.setattr(rollouts, "Buffers", lambda f, **options: sizes.append(f.nnz_out()) or buffers(f, **options))
+    buffers = program.Buffers
+    monkeypatch.setattr(program, "Buffers", lambda f, **options: sizes.append(f.nnz_out()) or buffers(f, **options))
     together = compiled(SCENARIOS["errors"], **options)(values).outputs[measured]
-    monkeypatch.setattr(rollouts, "MOST_BYTES", 1)
+    monkeypatch.setattr(program, "MOST_BYTES", 1)
     apart = compiled(SCENARIOS["errors"], **options)(values).outputs[measured]
     np.testing.assert_array_equal(apart, together)
     assert len(np.unique(together[:, -1, 0])) == 4

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array
-from vtbdrake.compiled.compiled_rollouts import CompiledRollouts, Program
+from vtbdrake.compiled.compiled_rollouts import CompiledRollouts
 from vtbdrake.compiled.equations import UnsupportedTestbedError
+from vtbdrake.compiled.program import Program
 from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.testbed.instants import sample_instants
 
