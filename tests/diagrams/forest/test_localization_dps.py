@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,6 +14,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
 from tests.diagrams.forest.riding import SCAN_PERIOD, RidingScenario, pose
+from tests.diagrams.lock_step_loop import TIMEOUT, deployed, run_all
 from tests.visualization.meshcat_page import messages
 from vtbdrake.common.scan import Scan
 from vtbdrake.components.localization.dead_reckoning import DeadReckoning
@@ -30,10 +29,6 @@ from vtbdrake.components.world_model import (
     position_estimate,
     save_geojson,
 )
-from vtbdrake.control.runtime import Runtime
-from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveWatch
 from vtbdrake.recording import read_log
 from vtbdrake.recording.replay import replay
@@ -48,7 +43,6 @@ from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
 CYCLES = 150
-TIMEOUT = 60.0  # s; for a computer that is busy with other things
 
 
 @cache
@@ -259,36 +253,15 @@ class Drive:
     seen: dict[str, np.ndarray]
 
 
-@contextmanager
-def deployed(target: DpsAlone | VirtualTestbed, context: Context, **options: Any) -> Iterator[tuple[Runtime, str]]:
-    """Drive in lock-step with the machine of `RidingScenario`, and give loop and URL at the end."""
-    scenario = RidingScenario()
-    deployment = Deployment.of(scenario).in_lock_step("imu")
-    with (
-        Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True),
-        target.scenario.deploy(hub.url, target=target, context=context, deployment=deployment, **options) as runtime,
-    ):
-        yield runtime, hub.url
-
-
-def run_all(runtime: Runtime) -> None:
-    assert runtime.slow_parts.wait(TIMEOUT)
-    runtime.take_over()
-    # A machine in lock-step leaves no time to compute. The first cycle receives; the second commands.
-    runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
-    assert not runtime.guards.latched
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     dps, log = DpsAlone(RidingScenario()), tmp_path_factory.mktemp("drive") / "drive.lcm"
     context = dps.default_context()
     with (
-        deployed(dps, context, record=log, live=True) as (runtime, url),
+        deployed(RidingScenario(), dps, context, paced_by="imu", record=log, live=True) as (runtime, url),
         LiveWatch(url, WATCHED, timeout=TIMEOUT) as live,
     ):
-        run_all(runtime)
+        run_all(runtime, CYCLES)
         after = context.Clone()
         # On a busy computer, the client's request comes late. The loop answers only while it runs.
         runtime.run(until=lambda: len(live.arrays()["time"]) >= 10)
@@ -312,8 +285,8 @@ def test_throwing_the_switches_changes_nothing_else(drive: Drive) -> None:
     # The simulated world is another stand than the one on the map, in which the unit would not be localized.
     testbed = built(stand_seed=4)
     context = testbed.default_context()
-    with deployed(testbed, context) as (runtime, _):
-        run_all(runtime)
+    with deployed(RidingScenario(), testbed, context, paced_by="imu") as (runtime, _):
+        run_all(runtime, CYCLES)
     assert testbed.read(context, f"{POSE}.status") == TRACKING
     # The first cycle still sees the simulated IMU.
     for name in ("position", "heading"):

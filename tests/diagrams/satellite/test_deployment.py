@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.diagrams.lock_step_loop import deployed, run_all
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.satellite import SatelliteScenario
@@ -15,7 +14,6 @@ from vtbdrake_diagrams.satellite.dps import PERIOD
 
 CYCLES = 60
 AHEAD = 7  # By how many cycles the clock of the DPS is ahead of the satellite's.
-TIMEOUT = 60.0  # s; for a computer that is busy with other things
 READ = [f"dps.env.target.{name}" for name in ("pose", "fused", "left_out")]
 
 
@@ -27,17 +25,8 @@ def test_poses_from_a_satellite_are_dated_by_the_clock_of_the_dps(perception: st
     simulated, own = testbed.default_context(), dps.default_context()
     testbed.simulator(simulated).AdvanceTo((CYCLES - 1) * PERIOD)
     own.SetTime(AHEAD * PERIOD)
-    deployment = Deployment.of(scenario).in_lock_step("joint_position")
-    with (
-        Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True),
-        scenario.deploy(hub.url, target=dps, context=own, deployment=deployment) as runtime,
-    ):
-        assert runtime.slow_parts.wait(TIMEOUT)
-        runtime.take_over()
-        # A satellite in lock-step leaves no time to compute. The first cycle receives; the second commands.
-        runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
-        assert not runtime.guards.latched
+    with deployed(scenario, dps, own, paced_by="joint_position") as (runtime, _):
+        run_all(runtime, CYCLES)
     ways = (testbed, simulated), (dps, own)
     (expected, fused, _), (pose, used, left_out) = ([system.read(c, a) for a in READ] for system, c in ways)
     assert used >= fused >= 6.0 and left_out == 0.0

@@ -9,9 +9,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
+from tests.diagrams.lock_step_loop import deployed, run_all
 from vtbdrake.testbed import DpsAlone, ScenarioError
 from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
 from vtbdrake_diagrams.space_climber.crater_scenario import X_BL
@@ -39,7 +37,6 @@ from vtbdrake_diagrams.space_climber.survey import survey
 from vtbdrake_diagrams.space_climber.terrain import Crater
 
 SEED = 1000
-TIMEOUT = 120.0  # s; for a computer that is busy, and compiles
 INPUTS: Mapping[str, list[float]] = {
     "pose": [0.0] * 6,
     "navigation": [0.0] * 12,
@@ -169,17 +166,8 @@ def test_dps_decides_in_drake_and_on_a_machine_as_the_judged_robot_does() -> Non
     simulator.AdvanceTo(LOOKING + 2.0 * PERIOD)
     in_between = testbed.snapshot(simulated)
     simulator.AdvanceTo(end)
-    deployment = Deployment.of(scenario).in_lock_step("joint_encoders")
-    with (
-        Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True),
-        scenario.deploy(hub.url, target=dps, context=own, deployment=deployment) as runtime,
-    ):
-        assert runtime.slow_parts.wait(TIMEOUT)
-        runtime.take_over()
-        cycles = round(end / scenario.period)
-        runtime.run(cycles=cycles - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
-        assert not runtime.guards.latched
+    with deployed(scenario, dps, own, paced_by="joint_encoders") as (runtime, _):
+        run_all(runtime, round(end / scenario.period))
         decided = [target.read(context, "dps.head.decision") for target, context in ((testbed, simulated), (dps, own))]
         gains = [target.read(context, "dps.head.gain") for target, context in ((testbed, simulated), (dps, own))]
     assert np.array_equal(decided[0], [stop.heading, stop.walk, 1.0])
