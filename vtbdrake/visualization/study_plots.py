@@ -29,8 +29,16 @@ if TYPE_CHECKING:
     from vtbdrake.optimization.study import Study
 
 BEST = "#d6604d"
+_POINTS = "#2166ac"
 _BROKEN = "0.45"
 _DROPPED = "0.6"
+_METHODS = colormaps["tab10"]
+_ORDER = colormaps["viridis"]
+_ORDER_LABEL = "point, in the order of the study"
+# Number of colours of the contours between points.
+_LEVELS = 12
+# Number of panels side by side.
+_PER_ROW = 4
 
 
 @dataclass(frozen=True)
@@ -282,12 +290,8 @@ def _keys(marks: Sequence[tuple[str, tuple[Trial, ...], dict[str, Any], str]]) -
     return [Line2D([], [], label=f"{text} ({len(trials)})", **style) for _, trials, style, text in marks]
 
 
-_SINGLE = "#2166ac"
-_LEVELS = 12
-
-
 def plot_landscape(study: Study, *addresses: str) -> Figure:
-    """Plot every quality over one or two parameters; if num_others vary too, the best value at each place.
+    """Plot every quality over one or two parameters; if others vary too, the best value at each place.
 
     Over two: an image where the points fill a grid; else filled contours between the points if nothing but these two
     numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
@@ -350,7 +354,7 @@ def _draw_line(
     axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, num_others: int
 ) -> list[Artist]:
     """Draw the values and return legend entries."""
-    draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
+    draw_slice(axes, study, points, scale, quality=quality, color=_POINTS)
     axes.set_ylabel(quality_label(study, quality))
     best = points.best_at(lambda trials: scale.places(trials)[:, None], quality, study.signs[quality])
     handles: list[Artist] = []
@@ -359,7 +363,7 @@ def _draw_line(
         order = np.argsort(scale.places(best.valued))
         text = f"the best over {_count(num_others)}" if num_others else None
         at, h = scale.places(best.valued)[order], values(best.valued, quality)[order]
-        (line,) = axes.plot(at, h, color=_SINGLE, lw=1.2, zorder=2, label=text, gid="h")
+        (line,) = axes.plot(at, h, color=_POINTS, lw=1.2, zorder=2, label=text, gid="h")
         handles = [line] if num_others else []
     return [*handles, *point_keys(study, points)]
 
@@ -436,15 +440,6 @@ def _legend_with_best(
 
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-__all__ = ["plot_history", "plot_importances", "plot_landscape", "plot_pareto", "plot_slices"]
-
-_METHODS = colormaps["tab10"]
-_ORDER = colormaps["viridis"]
-_BARS = "#2166ac"
-_PER_ROW = 4
-_ORDER_LABEL = "point, in the order of the study"
 
 
 def plot_history(study: Study) -> Figure:
@@ -537,7 +532,7 @@ def plot_importances(study: Study) -> Figure:
     points = Points.of(study)
     for quality, axes in enumerate(figure.subplots(len(shares), 1, squeeze=False)[:, 0]):
         addresses = list(shares[quality])
-        bars = axes.barh(addresses, list(shares[quality].values()), color=_BARS, height=0.6, gid="importance")
+        bars = axes.barh(addresses, list(shares[quality].values()), color=_POINTS, height=0.6, gid="importance")
         axes.bar_label(bars, fmt=lambda share: f"{share:.1%}", padding=4, fontsize="small")
         axes.invert_yaxis()
         axes.set_xlim(0.0, 1.1 * max(shares[quality].values()))
@@ -578,7 +573,7 @@ def plot_pareto(study: Study) -> Figure:
         finish(axes)
     handles = [
         Line2D([], [], color=BEST, marker="o", ls="none", label=f"Pareto front ({len(front)})"),
-        Line2D([], [], color=_BARS, marker="o", ls="none", ms=5, alpha=0.6, label="other points"),
+        Line2D([], [], color=_POINTS, marker="o", ls="none", ms=5, alpha=0.6, label="other points"),
     ]
     _legend(figure, [*handles, *point_keys(study, replace(points, failed=()))])
     if points.failed:
@@ -589,7 +584,7 @@ def plot_pareto(study: Study) -> Figure:
 def _draw_pair(axes: Axes, study: Study, points: Points, pair: tuple[int, int]) -> None:
     i, j = pair
     axes.scatter(
-        values(points.feasible, i), values(points.feasible, j), s=22, color=_BARS, alpha=0.6, linewidths=0, gid="kept"
+        values(points.feasible, i), values(points.feasible, j), s=22, color=_POINTS, alpha=0.6, linewidths=0, gid="kept"
     )
     axes.plot(values(points.broken, i), values(points.broken, j), gid="broken", **BROKEN_STYLE)
 
