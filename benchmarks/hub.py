@@ -25,7 +25,7 @@ TIMEOUT_MS = 10_000
 SIZE = 200  # bytes, about as in a robot's state
 
 # Another process that sends back what it gets.
-_ECHO = """
+ECHO = """
 import lcm, sys
 bus = lcm.LCM(sys.argv[1])
 bus.subscribe("PING", lambda _, data: bus.publish("PONG", data))
@@ -180,7 +180,7 @@ def _tcp_echo() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def _echo(url: str) -> Iterator[None]:
-    with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
+    with subprocess.Popen([sys.executable, "-c", ECHO, url]) as process:
         try:
             yield
         finally:

@@ -14,6 +14,7 @@ from drake import lcmt_iiwa_status
 
 from benchmarks.bare_loop import bare_loop
 from benchmarks.drake_loop import DrakeLoop
+from benchmarks.hub import ECHO
 from benchmarks.loop_rig import PERIOD, PRIORITY, WARM_UP, loop_rig
 from benchmarks.measure import HIGHER, LOWER, Benchmark
 from vtbdrake.control.clock import WallClock
@@ -24,15 +25,6 @@ from vtbdrake_diagrams.manipulator.arm import JOINTS
 PACE = "joint_position"  # comes with the first of the machine's messages
 PER = 10_000  # cycles, for which misses are counted
 TIMEOUT_MS = 5_000
-
-_ECHO = """
-import lcm, sys
-bus = lcm.LCM(sys.argv[1])
-bus.subscribe("PING", lambda _, data: bus.publish("PONG", data))
-bus.publish("PONG", b"")
-while True:
-    bus.handle()
-"""
 
 
 def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
@@ -208,7 +200,7 @@ def _echo(url: str) -> Iterator[lcm.LCM]:
     """A client whose messages another process sends back."""
     bus = lcm.LCM(url)
     bus.subscribe("PONG", lambda *_: None)
-    with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
+    with subprocess.Popen([sys.executable, "-c", ECHO, url]) as process:
         try:
             _await(bus)
             # It represents a machine, which has another processor than the controller that starts it.
