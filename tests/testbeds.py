@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import Value
+from pydrake.geometry import AddContactMaterial, GeometryInstance, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
+from pydrake.multibody.fem import DeformableBodyConfig
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem, System
 from pydrake.systems.primitives import Adder, Demultiplexer, Gain, ZeroOrderHold
@@ -154,3 +156,12 @@ class PoseRelay(LeafSystem):
             output.set_value(seen.Eval(context).inverse())  # type: ignore[attr-defined]
 
         self.DeclareAbstractOutputPort("commanded", lambda: Value(RigidTransform()), calc)
+
+
+def add_deformable_ball(plant: MultibodyPlant) -> None:
+    """Add a ball that deforms and falls, the first group of discrete state after that of the rigid bodies."""
+    properties = ProximityProperties()
+    AddContactMaterial(friction=CoulombFriction(0.5, 0.5), properties=properties)
+    ball = GeometryInstance(RigidTransform([0.0, 0.0, 3.0]), Sphere(0.1), "ball")
+    ball.set_proximity_properties(properties)
+    plant.mutable_deformable_model().RegisterDeformableBody(ball, DeformableBodyConfig(), 1.0)

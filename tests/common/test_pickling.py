@@ -5,7 +5,10 @@ import subprocess
 import sys
 from dataclasses import MISSING, dataclass, field, fields
 
+import pydrake.symbolic
 import pytest
+from pydrake.autodiffutils import InitializeAutoDiff
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 
 from vtbdrake.common.pickling import dumps
 
@@ -88,3 +91,9 @@ def test_dataclass_can_be_derived_from_after_its_class_was_sent():
 
     assert Derived() == Derived(numbers=[], size=3)
     assert [entry.default is MISSING for entry in fields(Derived)] == [True, False]
+
+
+@pytest.mark.parametrize("function", [AddMultibodyPlantSceneGraph, InitializeAutoDiff, pydrake.symbolic.min])
+def test_functions_of_drake_that_a_script_imports_are_sent(function):
+    law = eval("lambda: function", {"function": function, "__name__": "__main__"})
+    assert pickle.loads(dumps(law))() is function

@@ -29,6 +29,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from pydrake.systems.primitives import Integrator, PortSwitch
 
 import vtbdrake.drake_workarounds
+from tests.testbeds import add_deformable_ball
 from vtbdrake.common.drake_version import TESTED_DRAKE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -355,6 +356,28 @@ def metaclass_is_not_pickled() -> bool:
     except pickle.PicklingError:
         return True
     return False
+
+
+@reproduces("common.pickling")
+def function_is_not_pickled() -> bool:
+    try:
+        pickle.dumps(AddMultibodyPlant)
+    except (TypeError, pickle.PicklingError):
+        return True
+    return False
+
+
+@reproduces("testing.checks.repetition_checks")
+def reset_leaves_deformable_bodies_as_they_are() -> bool:
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
+    add_deformable_ball(plant)
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    start = context.get_discrete_state(1).value().copy()
+    context.SetDiscreteState(1, start + 0.1)
+    plant.SetDefaultContext(context)
+    return not np.array_equal(context.get_discrete_state(1).value(), start)
 
 
 @reproduces("testbed.switch")

@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
-from pydrake.geometry import AddContactMaterial, GeometryInstance, ProximityProperties, Sphere
-from pydrake.math import RigidTransform
-from pydrake.multibody.fem import DeformableBodyConfig
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
-    CoulombFriction,
     DistanceConstraintParams,
     MultibodyPlant,
 )
@@ -25,7 +21,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from tests.testbeds import ACROBOT
+from tests.testbeds import ACROBOT, add_deformable_ball
 from vtbdrake.state import Snapshot, VariableError, collect, snapshot
 from vtbdrake.state.multibody import multibody_variables
 
@@ -164,11 +160,7 @@ def linked():
     a, b = plant.GetBodyByName("a"), plant.GetBodyByName("b")
     rod = plant.AddDistanceConstraint(a, [0, 0, 0], b, [0, 0, 0], 0.5)
     coupler = plant.AddCouplerConstraint(slides[0], slides[1], 2.0, -1.0)
-    properties = ProximityProperties()
-    AddContactMaterial(dissipation=1.0, friction=CoulombFriction(0.5, 0.5), properties=properties)
-    ball = GeometryInstance(RigidTransform([0, 0, 3]), Sphere(0.1), "ball")
-    ball.set_proximity_properties(properties)
-    plant.mutable_deformable_model().RegisterDeformableBody(ball, DeformableBodyConfig(), 1.0)
+    add_deformable_ball(plant)
     plant.Finalize()
     diagram = builder.Build()
     return plant, diagram, collect(diagram), (rod, coupler)

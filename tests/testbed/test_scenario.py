@@ -419,6 +419,10 @@ def test_what_is_meant_is_taken_as_pythons_own_type(name, given, kept):
     assert type(value) is type(kept)
 
 
+def test_a_field_that_may_be_none_is_set_back_to_none():
+    assert Varied(height=0.4).with_fields({"height": None}) == Varied()
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -434,7 +438,8 @@ def test_what_is_meant_is_taken_as_pythons_own_type(name, given, kept):
         ({"period": True}, "period must be a finite number, not True"),
         ({"period": "fast"}, "a finite number, not 'fast'"),
         ({"period": [0.1]}, "a finite number, not .0.1."),
-        ({"height": None}, "a finite number, not None"),
+        ({"period": None}, "a finite number, not None"),
+        ({"height": "low"}, "Varied.height must be a finite number, not 'low'"),
         ({"gait": 3}, "gait must be a text, not 3"),
         ({"stops": 1}, "stops must be True or False, not 1"),
         ({"legs": 3}, "must be at least 4, not 3"),

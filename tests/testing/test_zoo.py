@@ -7,7 +7,7 @@ import pytest
 from tests.testing import zoo
 from vtbdrake.testing import ScenarioCheckError, check_scenario
 from vtbdrake.testing.checks import CHECKS
-from vtbdrake.testing.checks.repetition_checks import check_dropped_testbed_is_freed
+from vtbdrake.testing.checks.repetition_checks import check_dropped_testbed_is_freed, check_reset_equals_a_new_build
 from vtbdrake.testing.scenario_check import check_names
 from vtbdrake.testing.subject import CheckFailedError, CheckSkippedError, Subject
 
@@ -81,6 +81,10 @@ def test_bad_diagram_fails_its_check(name):
     (check,) = (check for check in CHECKS if check.__name__ == name)
     error = Subject(zoo.BAD[name](), horizon=HORIZON).outcome(check)
     assert isinstance(error, CheckFailedError) and MESSAGES[name] in str(error)
+
+
+def test_deformable_body_is_no_system_that_changes_its_defaults():
+    assert Subject(zoo.Soft(), horizon=HORIZON).outcome(check_reset_equals_a_new_build) is None
 
 
 def test_function_that_keeps_a_testbed_is_named():

@@ -12,11 +12,13 @@ import numpy as np
 from drake import lcmt_acrobot_u, lcmt_acrobot_x, lcmt_header
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue
 from pydrake.common.value import Value
+from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector_, DiagramBuilder, InputPort_, LeafSystem_, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, Gain, LinearSystem, ZeroOrderHold
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from tests.testbeds import add_deformable_ball
 from vtbdrake.control.fallback import Zero
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.maps import LcmMap, vector_map
@@ -389,6 +391,16 @@ class check_reset_equals_a_new_build(GoodScenario):  # noqa: N801
             builder.diagram_builder.GetSubsystemByName("sim.sys.axis").get_output_port(), slide.get_input_port()
         )
         builder.diagram_builder.GetSubsystemByName("sim.sense.encoder").system = slide
+
+
+class Soft(GoodScenario):
+    """The good diagram beside a deformable body, which Drake 1.51 does not reset."""
+
+    def add_world(self, builder):
+        super().add_world(builder)
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=PERIOD))
+        add_deformable_ball(plant)
+        plant.Finalize()
 
 
 class Buffer:

@@ -19,6 +19,10 @@ class _Pickler(cloudpickle.Pickler):
 
     With a dataclass it sends the fields, in which ``dataclasses.MISSING`` stands for what they do not have. A copy of
     that would be a default: even in the sender, whose class loading gives these fields, no class could derive from it.
+
+    A function of Drake's does not pickle: it holds a PyCapsule, or is an ``nb_func``. It is sent as an attribute of the
+    module that names it, so that scripts that begin with ``from pydrake.all import *`` can send their functions, which
+    refer to Drake's ``abs``, ``min`` or ``AddMultibodyPlantSceneGraph``.
     """
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -29,6 +33,8 @@ class _Pickler(cloudpickle.Pickler):
     def reducer_override(self, obj: Any) -> Any:
         if obj is dataclasses.MISSING:
             return getattr, (dataclasses, "MISSING")
+        if _is_function_of_drake(obj):
+            return getattr, (sys.modules[obj.__module__], obj.__name__)
         if isinstance(obj, type):
             if obj in self._bearers:
                 return type, (self._bearers[obj],)
@@ -43,6 +49,12 @@ def _importable(kind: type) -> bool:
     for name in kind.__qualname__.split("."):
         attribute = getattr(attribute, name, None)
     return attribute is kind and kind.__module__ != "__main__"
+
+
+def _is_function_of_drake(value: Any) -> bool:
+    """Return whether a value is a function of pybind11's or nanobind's that its module has under its name."""
+    is_bound = type(value).__name__ == "nb_func" or type(getattr(value, "__self__", None)).__name__ == "PyCapsule"
+    return is_bound and getattr(sys.modules.get(value.__module__), value.__name__, None) is value
 
 
 def dumps(value: Any) -> bytes:

@@ -23,6 +23,9 @@ Faults whose remedy is part of something larger, and where that is:
   (https://github.com/RobotLocomotion/drake/issues/7827): `vtbdrake.common.failures.FAILURES`.
 * Drake's configs cannot be pickled: `vtbdrake.testbed.scenario` registers how. Nor can the metaclass of pydrake's
   classes: `vtbdrake.common.pickling`.
+* Nor can pydrake's functions be pickled, such as AddMultibodyPlantSceneGraph: `vtbdrake.common.pickling`, too.
+* SetDefaultContext leaves deformable bodies as they are in Drake 1.51: `vtbdrake.testing.checks.repetition_checks` does
+  not ask for it.
 * pydrake has a PortSwitch for vectors only: `vtbdrake.testbed.switch.AbstractSwitch`.
 
 ``tests/drake_workarounds`` holds the smallest reproduction of each. A reproduction that fails with the oldest supported

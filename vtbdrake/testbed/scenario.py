@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, is_dataclass, replace
 from inspect import get_annotations
+from types import NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Union
 
 import numpy as np
@@ -20,7 +21,7 @@ from pydrake.systems.framework import System
 
 from vtbdrake import upper_layers
 from vtbdrake.common.argument_checks import suggestion
-from vtbdrake.common.field_types import field_types
+from vtbdrake.common.field_types import alternatives, field_types
 from vtbdrake.common.settings import check_settings, check_value, plain_types
 from vtbdrake.drake_workarounds.cenic import DRAKE, FIXED_STEPS_ARE_STALE
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
@@ -322,7 +323,8 @@ class Scenario(ABC):
 
         Args:
             values: Values by field, nested ones by dotted names (``simulator_config.accuracy``). Only fields that are a
-                bool, int, float or str can be set; an int will do for a float, and numpy's scalars for Python's.
+                bool, int, float or str can be set, to None if their type allows it; an int will do for a float, and
+                numpy's scalars for Python's.
 
         Raises:
             ScenarioError: There is no such field, the value has another type, or the scenario rejects it.
@@ -335,6 +337,8 @@ class Scenario(ABC):
                 raise ScenarioError(f"{type(self).__name__} has no field {name!r} of a plain type{near}")
             owner, annotation = owners[name]
             types = plain_types(annotation)
+            if value is None and NoneType in alternatives(annotation):
+                types = (*types, NoneType)
             check_value(f"{type(self).__name__}.{name}", value, Union[types], error=ScenarioError)  # noqa: UP007
             if isinstance(value, np.generic | np.ndarray):
                 value = value.item()

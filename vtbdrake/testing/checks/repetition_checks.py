@@ -12,6 +12,8 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, System
 
@@ -27,7 +29,7 @@ from vtbdrake.rollout.repeatability import (
 )
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.state import Snapshot
-from vtbdrake.state.systems import class_name
+from vtbdrake.state.systems import class_name, leaves
 from vtbdrake.state.variables import X
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testing.checks.scenario_checks import check_pickle_round_trip, check_yaml_round_trip
@@ -111,7 +113,8 @@ def check_reset_equals_a_new_build(subject: Subject) -> None:
     """Check that a reset Context and a new one equal the first Context of the build.
 
     Rollouts reset a Context instead of building anew. Who changes the defaults of a system while it is simulated
-    (SetDefaultPositions, configure_default_state) changes where all later rollouts begin.
+    (SetDefaultPositions, configure_default_state) changes where all later rollouts begin. In the Context that is reset,
+    deformable bodies are not compared: Drake 1.51 leaves them as they are. (Rollouts set them themselves.)
     """
     start, testbed = subject.start, subject.testbed
     context = subject.started(testbed)
@@ -119,13 +122,27 @@ def check_reset_equals_a_new_build(subject: Subject) -> None:
     testbed.diagram.SetDefaultContext(context)
     context.SetTime(0.0)
     testbed.write(context, subject.values)
-    for name, again in (("a used Context that is reset", context), ("a new Context", subject.started(testbed))):
-        differences = start.compare(testbed.snapshot(again))
+    deformable = set(_deformable_groups(testbed))
+    for name, again, left_out in (
+        ("a used Context that is reset", context, deformable),
+        ("a new Context", subject.started(testbed), set()),
+    ):
+        differences = start.compare(testbed.snapshot(again)).keys() - left_out
         if differences:
             raise CheckFailedError(
                 f"after a simulation, {name} differs from the first one in {', '.join(sorted(differences))}: a system "
                 "changes its defaults while it is simulated; let it change its context only"
             )
+
+
+def _deformable_groups(testbed: VirtualTestbed) -> Iterator[str]:
+    """Yield the keys of the groups of a snapshot in which plants have the nodes of deformable bodies."""
+    for path, system in leaves(testbed.diagram):
+        if isinstance(system, MultibodyPlant):
+            model = system.deformable_model()
+            for instance in map(ModelInstanceIndex, range(system.num_model_instances())):
+                for body in model.GetBodyIds(instance):
+                    yield f"{path}/discrete/{int(model.GetDiscreteStateIndex(body))}"
 
 
 def check_fork_is_the_future(subject: Subject) -> None:
