@@ -159,7 +159,7 @@ class PoseRelay(LeafSystem):
 
 
 def add_deformable_ball(plant: MultibodyPlant) -> None:
-    """Add a ball that deforms and falls, the first group of discrete state after that of the rigid bodies."""
+    """Add a ball that deforms and falls: discrete state 1, after the state of the rigid bodies."""
     properties = ProximityProperties()
     AddContactMaterial(friction=CoulombFriction(0.5, 0.5), properties=properties)
     ball = GeometryInstance(RigidTransform([0.0, 0.0, 3.0]), Sphere(0.1), "ball")

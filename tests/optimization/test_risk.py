@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.optimization import CVaR, Mean, Quantile, Worst
+from vtbdrake.optimization.records import Outcome
+from vtbdrake.optimization.risk import Risk, aggregate
 
 pytestmark = pytest.mark.one_python
 
@@ -65,3 +67,25 @@ def test_the_rank_of_a_quantile_is_that_of_exact_arithmetic():
         for count in (1, 7, 25, 50, 100):
             rank = ceil(Fraction(percent, 100) * count)
             assert Quantile(percent / 100)(np.arange(1.0, count + 1.0)) == rank
+
+
+class OfAUser(Risk):
+    def __init__(self, returned):
+        self.returned = returned
+
+    def __call__(self, h):
+        return self.returned
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ("1.5", "the risk OfAUser must return a real number, not '1.5'"),
+        (None, "the risk OfAUser must return a real number, not None"),
+        (float("nan"), r"the risk OfAUser is NaN for the qualities \[1\.0, 2\.0\]"),
+    ],
+)
+def test_a_risk_that_is_no_number_is_refused(returned, message):
+    outcomes = [Outcome(h, h, (), 0.0, "horizon", "", 0.0) for h in (1.0, 2.0)]
+    with pytest.raises(ValueError, match=message):
+        aggregate(outcomes, risk=OfAUser(returned), minimize=[False], constraints=0, bounds=[np.inf])

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from tests.testbeds import PendulumScenario
-from vtbdrake.rollout import Constraint, Cutoff, FuturesExecutor, Pruning, Quality, RolloutRunner, RolloutTask
+from vtbdrake.rollout import (
+    Constraint,
+    Cutoff,
+    FuturesExecutor,
+    Pruning,
+    Quality,
+    QualityError,
+    RolloutRunner,
+    RolloutTask,
+)
 from vtbdrake.rollout.pruning import Prospect
 
 HORIZON = 1.0
@@ -57,6 +66,12 @@ def test_a_users_bound_prunes_by_the_time_left():
     pruning = Pruning(bound=lambda left: 2.0 * left)
     # 2 left falls to 1.2 at the third sample, and below 1 at the fourth.
     assert ending(highest, np.zeros(6), to_beat=1.0, pruning=pruning) == (4, "pruned", pytest.approx(0.8))
+
+
+@pytest.mark.parametrize("bound", ["1.5", None])
+def test_a_bound_that_is_no_number_is_refused(bound):
+    with pytest.raises(QualityError, match=f"the bound of a pruning must return a real number, not {bound!r}"):
+        ending(Quality(abs, "x"), np.zeros(6), to_beat=1.0, pruning=Pruning(bound=lambda left: bound))
 
 
 def test_a_violated_constraint_prunes_unless_it_is_read_otherwise():

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from math import inf, nan
 
 import numpy as np
@@ -63,6 +64,33 @@ def test_t_star_and_h(trajectory, threshold, t_star, h, end):
     np.testing.assert_array_equal(result.quality, trajectory[: round(stop / PERIOD) + 1])
 
 
+@pytest.mark.parametrize(
+    ("returned", "shown"),
+    [
+        ("1.5", r"'1\.5'"),
+        (b"1.5", r"b'1\.5'"),
+        (np.array(["1.5"]), "array"),
+        (None, "None"),
+        (1j, "1j"),
+        ([1.5], r"\[1\.5\]"),
+        (np.zeros(2), r"an array of shape \(2,\)"),
+        (np.ma.masked, "masked"),
+    ],
+)
+@pytest.mark.parametrize("measure", [Quality, Constraint])
+def test_what_is_no_number_is_refused_with_what_was_returned(measure, returned, shown):
+    limits = {"at_most": 2.0} if measure is Constraint else {}
+    f = measure(lambda t: returned, "time", **limits)
+    with pytest.raises(QualityError, match=rf"at t = 0 s, time = 0\.0, must return a real number, not {shown}"):
+        f([0.0], time=0.0)
+
+
+@pytest.mark.parametrize("returned", [1.5, np.float32(1.5), np.array([1.5]), np.array(1.5), Fraction(3, 2)])
+def test_numbers_of_other_types_are_taken(returned):
+    assert Quality(lambda t: returned, "time")([0.0], time=0.0) == 1.5
+    assert Quality(lambda t: returned > 1.0, "time")([0.0], time=0.0) == 1.0
+
+
 def test_run_on_keeps_t_star():
     result, runner = _roll([0.0, 2.0, 0.5, 3.0, 0.0], threshold=1.0, run_on=True)
     assert result.exceedances == pytest.approx([0.1, 0.3])
@@ -110,7 +138,7 @@ def test_costs_of_any_size_are_compared_themselves(scale):
         (lambda t: nan, "is nan, but"),
         (lambda t: inf, "is inf, but"),
         (lambda t: 1 / 0, "raises ZeroDivisionError: division by zero"),
-        (lambda t: "good", "raises ValueError"),
+        (lambda t: "good", "must return a real number, not 'good'"),
         (lambda t: sys.exit("failure in Drake"), "raises SystemExit: failure in Drake"),
     ],
 )

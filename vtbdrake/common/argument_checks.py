@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.common.failures import FAILURES, safe_repr
 from vtbdrake.common.suggestions import did_you_mean
 
 
@@ -24,6 +25,30 @@ def as_number(name: str, value: Any) -> float:
         except (TypeError, ValueError):
             pass
     raise ValueError(f"{name} must be a number, not {value!r}")
+
+
+def as_result(value: Any) -> float:
+    """Return the result of a user's function as a float; True counts as 1.
+
+    Args:
+        value: A number, or an array of one number.
+
+    Raises:
+        ValueError: It is no real number: None, a text (also of a number), an array of several. The message goes on
+            after the name of the function.
+    """
+    if isinstance(value, float):
+        return float(value)
+    has_one = isinstance(value, np.ndarray) and value.size == 1 and not np.ma.is_masked(value)
+    number = value.item() if has_one else value
+    if not isinstance(number, str | bytes | bytearray | np.ndarray | np.timedelta64):
+        try:
+            return float(number)
+        except FAILURES:
+            pass
+    is_array = isinstance(number, np.ndarray) and number.size != 1
+    said = f"an array of shape {number.shape}" if is_array else safe_repr(value)
+    raise ValueError(f"must return a real number, not {said}")
 
 
 def as_whole(name: str, value: Any) -> int:

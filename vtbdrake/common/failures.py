@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any
@@ -18,8 +19,17 @@ _NOT_THE_USERS = tuple(
 
 def safe_text(value: Any) -> str:
     """Return ``str(value)`` as text that can be stored and printed, also if a method of the user fails in it."""
+    return _safe(str, value)
+
+
+def safe_repr(value: Any) -> str:
+    """Return ``repr(value)`` as `safe_text` returns its text: 1.5 and the text '1.5' look different."""
+    return _safe(repr, value)
+
+
+def _safe(text_of: Callable[[Any], str], value: Any) -> str:
     try:
-        text = str(value)
+        text = text_of(value)
     except Exception as error:  # Any class can have a faulty __str__ or __repr__.
         text = f"<{type(value).__name__}, whose text raises {type(error).__name__}>"
     # Half of a pair of surrogates has no bytes.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vtbdrake.common.argument_checks import as_number
+from vtbdrake.common.argument_checks import as_number, as_result
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.records import Outcome
@@ -118,6 +118,18 @@ def make_risk(risk: str | Risk) -> Risk:
     return RISKS[name]
 
 
+def _of_risk(risk: Risk, h: np.ndarray, *, complete: bool) -> float:
+    """Return the risk of qualities, shape (n,); infinity if it is NaN while conditions are still to run."""
+    returned = risk(h)
+    try:
+        value = as_result(returned)
+    except ValueError as error:
+        raise ValueError(f"the risk {type(risk).__name__} {error}") from None
+    if isnan(value) and complete:
+        raise ValueError(f"the risk {type(risk).__name__} is NaN for the qualities {h.tolist()}: return a number")
+    return inf if isnan(value) else value
+
+
 def aggregate(
     outcomes: Sequence[Outcome | RolloutResult | None],
     *,
@@ -148,8 +160,8 @@ def aggregate(
         qualities = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]
         # A user's risk may make NaN of infinities if nothing bounds the conditions that have not run.
         with np.errstate(invalid="ignore"):
-            value = float(risk(np.array([-number if cost else number for number in qualities])))
-        values.append(inf if isnan(value) and None in outcomes else value)
+            h = np.array([-number if cost else number for number in qualities])
+            values.append(_of_risk(risk, h, complete=None not in outcomes))
     tried = [outcome for outcome in outcomes if outcome is not None]
     first = len(values) - 1
     violations = [max((o.measures[first + k] for o in tried), default=-inf) for k in range(constraints)]

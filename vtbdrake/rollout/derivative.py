@@ -11,6 +11,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator_
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.argument_checks import as_result
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.rollout.quality import READINGS, Quality
 from vtbdrake.rollout.task import RolloutTask
@@ -175,7 +176,7 @@ class DerivativeRunner:
     def _f(self, context: Context, t: float, *, checked: bool = True) -> float:
         arguments = [read(context) for read in self._readers]
         # A step may make f negative.
-        return self._quality(arguments, time=t) if checked else float(self._quality.f(*arguments))
+        return self._quality(arguments, time=t) if checked else as_result(self._quality.f(*arguments))
 
     def _read(self, times: np.ndarray, samples: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
         t, value = READINGS[self._quality.reading](times, samples, not self._quality.minimize)

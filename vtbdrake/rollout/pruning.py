@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, isnan, nan
 
-from vtbdrake.common.argument_checks import as_addresses, as_number, check_takes
+from vtbdrake.common.argument_checks import as_addresses, as_number, as_result, check_takes
 from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 
@@ -159,9 +159,13 @@ class Prospect:
     def _bound(self, left: float, values: Sequence[object]) -> float:
         assert self._pruning.bound is not None
         try:
-            bound = float(self._pruning.bound(left, *values))
+            value = self._pruning.bound(left, *values)
         except FAILURES as error:
             raise QualityError(f"the bound of a pruning raises {error_text(error)}") from error
+        try:
+            bound = as_result(value)
+        except ValueError as error:
+            raise QualityError(f"the bound of a pruning {error}") from None
         if isnan(bound):
             raise QualityError(f"the bound of a pruning is NaN with {left:g} s left, for {values}")
         return bound

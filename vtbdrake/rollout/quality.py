@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vtbdrake.common.argument_checks import as_addresses, as_flag, as_number, check_takes
+from vtbdrake.common.argument_checks import as_addresses, as_flag, as_number, as_result, check_takes
 from vtbdrake.common.failures import FAILURES, error_text, safe_text
 
 # (times, samples, True if larger samples are better) -> (time, number): of samples of shape (..., n) at times of shape
@@ -115,12 +115,16 @@ class Measure:
             time: Time of the sample, in seconds, for error messages.
 
         Raises:
-            QualityError: f raises, or returns something that is not a finite number.
+            QualityError: f raises, or returns something that is not a finite number, such as None or a text.
         """
         try:
-            sample = float(self.f(*values))
+            value = self.f(*values)
         except FAILURES as error:
             raise QualityError(f"{self._at(values, time)} raises {error_text(error)}") from error
+        try:
+            sample = as_result(value)
+        except ValueError as error:
+            raise QualityError(f"{self._at(values, time)} {error}") from None
         self._refuse_invalid(sample, lambda: self._at(values, time))
         return sample
 
