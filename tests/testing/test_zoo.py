@@ -7,6 +7,7 @@ import pytest
 from tests.testing import zoo
 from vtbdrake.testing import ScenarioCheckError, check_scenario
 from vtbdrake.testing.checks import CHECKS
+from vtbdrake.testing.checks.boundary_checks import check_dps_alone_commands_the_same, check_dps_cannot_tell_the_switch
 from vtbdrake.testing.checks.repetition_checks import check_dropped_testbed_is_freed, check_reset_equals_a_new_build
 from vtbdrake.testing.scenario_check import check_names
 from vtbdrake.testing.subject import CheckFailedError, CheckSkippedError, Subject
@@ -85,6 +86,11 @@ def test_bad_diagram_fails_its_check(name):
 
 def test_deformable_body_is_no_system_that_changes_its_defaults():
     assert Subject(zoo.Soft(), horizon=HORIZON).outcome(check_reset_equals_a_new_build) is None
+
+
+@pytest.mark.parametrize("check", [check_dps_cannot_tell_the_switch, check_dps_alone_commands_the_same])
+def test_dps_between_the_instants_that_drake_tells_is_fed_in_time(check):
+    assert Subject(zoo.Offset(), horizon=HORIZON).outcome(check) is None
 
 
 def test_function_that_keeps_a_testbed_is_named():

@@ -14,7 +14,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue
 from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector_, DiagramBuilder, InputPort_, LeafSystem_, System
+from pydrake.systems.framework import BasicVector_, DiagramBuilder, InputPort_, LeafSystem, LeafSystem_, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, Gain, LinearSystem, ZeroOrderHold
 from pydrake.systems.scalar_conversion import TemplateSystem
 
@@ -391,6 +391,28 @@ class check_reset_equals_a_new_build(GoodScenario):  # noqa: N801
             builder.diagram_builder.GetSubsystemByName("sim.sys.axis").get_output_port(), slide.get_input_port()
         )
         builder.diagram_builder.GetSubsystemByName("sim.sense.encoder").system = slide
+
+
+class PlainPilot(LeafSystem):
+    """A DPS whose timing Drake does not tell: 3 ms after the measurements, by an unrestricted update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ports = [self.DeclareVectorInputPort(name, 1) for name in ("position", "speed", "target")]
+        self.velocity = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("velocity", self.velocity)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.3 * PERIOD, self.update)
+
+    def update(self, context, state):
+        position, _, target = (port.Eval(context) for port in self.ports)
+        state.get_mutable_discrete_state(self.velocity).SetFromVector(2.0 * (target - position))
+
+
+class Offset(GoodScenario):
+    """The good diagram with a DPS between the instants that Drake tells."""
+
+    def make_dps(self):
+        return PlainPilot()
 
 
 class Soft(GoodScenario):

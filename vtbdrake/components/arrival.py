@@ -69,7 +69,6 @@ class Arrival(AddressedSystem):
             self.DeclareStateOutputPort(name, index)
         self._sample = int(sample)
         self._settings = self.declare_parameters(age=Quantity(age, "s", (0.0, 60.0)))
-        self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> EventStatus:

@@ -78,7 +78,6 @@ class FmuSystem(AddressedSystem):
         super().__init__()
         fmu = ImportedFmu(path, fork=as_flag("FmuSystem: fork", fork))
         self._period = _period(fmu, period)
-        self.timings = ((self._period, 0.0),)
         ports_in, ports_out = fmu.ports("input", inputs), fmu.ports("output", outputs)
         numbers, texts = _start_values(fmu, parameters or {})
         self._instances = Instances(

@@ -341,12 +341,15 @@ class AddressedSystem(_LeafSystem):
             this attribute has its groups as variables. Subclasses may change it.
         entry_names: The names of the entries of all its variables of shape (len(entry_names),), such as names of its
             joints; empty if they have none.
+        timings: The timings (period, offset) of the periodic updates that have been declared, in s. Drake does not tell
+            the timings of unrestricted updates, nor of several.
     """
 
     __slots__ = NO_DICT
 
     variables: tuple[Element, ...]
     entry_names: tuple[str, ...] = ()
+    timings: tuple[tuple[float, float], ...] = ()
 
     def declare_parameters(self, **quantities: Quantity) -> ParameterGroup:
         """Declare a group of parameters, part of a in s = [x, a]."""
@@ -414,6 +417,28 @@ class AddressedSystem(_LeafSystem):
             """
             arguments, options = self._not_holding_any(arguments, options)
             return super().DeclareAbstractOutputPort(*arguments, **options)
+
+        def DeclarePeriodicDiscreteUpdateEvent(self, period_sec: float, offset_sec: float, update: Any) -> None:
+            """Declare a discrete update, as Drake does, and remember its timing.
+
+            Args:
+                period_sec: The time between two updates, in s.
+                offset_sec: The time of the first update, in s.
+                update: The function of the update.
+            """
+            super().DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, update)
+            self.timings = (*self.timings, (float(period_sec), float(offset_sec)))
+
+        def DeclarePeriodicUnrestrictedUpdateEvent(self, period_sec: float, offset_sec: float, update: Any) -> None:
+            """Declare an unrestricted update, as Drake does, and remember its timing.
+
+            Args:
+                period_sec: The time between two updates, in s.
+                offset_sec: The time of the first update, in s.
+                update: The function of the update.
+            """
+            super().DeclarePeriodicUnrestrictedUpdateEvent(period_sec, offset_sec, update)
+            self.timings = (*self.timings, (float(period_sec), float(offset_sec)))
 
     def _not_holding_any(
         self, arguments: Iterable[Any], options: Mapping[str, Any]

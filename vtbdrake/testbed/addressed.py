@@ -325,7 +325,7 @@ class AddressedDiagram:
 
         The n-th update is at offset + n * period. Drake tells the timing of a system with one kind of discrete updates.
         That of discrete plants and of holds is known, too; of other unrestricted updates, and of several updates, it is
-        what the system declares in an attribute ``timings``, pairs like these.
+        what the system has in an attribute ``timings``, pairs like these. An `AddressedSystem` fills it by itself.
         """
         systems = [system for _, system in leaves(self.diagram)]
         attributes = (system.GetUniquePeriodicDiscreteUpdateAttribute() for system in systems)

@@ -203,7 +203,6 @@ class Camera(AddressedSystem):
         self._declare_state(depth, max(errors.latency, errors.max_latency))
         self._scene = self.declare_cache("scene", lambda context: RenderedScene(), {self.nothing_ticket()})
         self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
-        self.timings = ((self.period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._sample)
 
     def _declare_parameters(

@@ -225,7 +225,6 @@ class LaserScanner(AddressedSystem):
         self._haze_port = self.DeclareVectorInputPort("haze", HAZE.size)
         self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors)
         self._declare_state()
-        self.timings = ((self.slice_period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.slice_period, 0.0, self._end_slice)
 
     def _declare_parameters(self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel) -> None:

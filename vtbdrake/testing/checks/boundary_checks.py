@@ -102,7 +102,7 @@ def _repeat_commands(subject: Subject, target: Any, context: Any, feed: Feed, wh
     expected = testbed.simulator(expected_context)
     expected.Initialize()
     sense, commands = subject.readers(testbed)
-    for instant in _event_times(testbed, float(subject.instants[-1])):
+    for instant in _event_times(subject):
         if instant > expected_context.get_time():
             expected.AdvanceTo(instant)
             assert simulator is not None
@@ -129,11 +129,18 @@ def _repeat_commands(subject: Subject, target: Any, context: Any, feed: Feed, wh
                 )
 
 
-def _event_times(testbed: VirtualTestbed, end: float) -> list[float]:
-    """Return 0 and the times of all periodic updates up to ``end``: between two, no sampled value changes."""
+def _event_times(subject: Subject) -> list[float]:
+    """Return 0 and the times of all steps of a simulation: between two, no sampled value changes.
+
+    Drake does not tell the timings of all updates; but it ends a step at each.
+    """
+    testbed, end = subject.testbed, float(subject.instants[-1])
     times = {0.0, end}
     for period, offset in testbed.event_timings():
         times.update(offset + n * period for n in range(int((end - offset) / period) + 1))
+    simulator = testbed.simulator(subject.started(testbed))
+    simulator.set_monitor(lambda context: times.add(context.get_time()))
+    simulator.AdvanceTo(end)
     in_order = sorted(time for time in times if 0.0 <= time <= end)
     # Two ways to compute one instant differ in the last bits; Drake stops at the first.
     return [0.0, *(time for before, time in pairwise(in_order) if time - before > _SAME_INSTANT)]
