@@ -14,7 +14,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError, Snapshot, SnapshotError
-from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
+from vtbdrake.station import Station
+from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, load_scenario
 from vtbdrake.testbed.scenario_file import compose_yaml
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
@@ -417,6 +418,19 @@ def test_what_is_meant_is_taken_as_pythons_own_type(name, given, kept):
     value = getattr(Varied().with_fields({name: given}), name)
     assert value == kept
     assert type(value) is type(kept)
+
+
+@pytest.mark.parametrize(
+    ("base", "field", "method"),
+    [(Scenario, "name", "name"), (AcrobotScenario, "samples", "samples"), (Station, "signals", "signals")],
+)
+def test_a_field_under_the_name_of_a_method_is_refused(base, field, method):
+    owner = next(kind.__name__ for kind in base.__mro__ if method in vars(kind))
+    message = f"Robot.{field} would replace the method {method} of {owner}: give it another name, such as robot_{field}"
+    with pytest.raises(ScenarioError, match=message):
+        type("Robot", (base,), {"__annotations__": {field: str}, field: "a"})
+    with pytest.raises(ScenarioError, match=message):
+        type("Robot", (base,), {field: "a"})
 
 
 def test_a_field_that_may_be_none_is_set_back_to_none():

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, is_dataclass, replace
 from inspect import get_annotations
-from types import NoneType
+from types import FunctionType, NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Union
 
 import numpy as np
@@ -75,6 +75,7 @@ class Scenario(ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        _refuse_replaced_methods(cls)
         # Else, the dataclass decorator would replace them: Drake's configs have no equality.
         for name in ("__eq__", "__repr__"):
             if name not in cls.__dict__:
@@ -494,6 +495,21 @@ def _drake_types(value: Any) -> Iterator[type]:
     if isinstance(value, list | tuple):
         for item in value:
             yield from _drake_types(item)
+
+
+def _refuse_replaced_methods(kind: type[Scenario]) -> None:
+    """Raise a ScenarioError if a class has a field or a value under the name of one of this package's methods."""
+    annotated = get_annotations(kind)
+    for name in {**annotated, **vars(kind)}:
+        base = next((base for base in kind.__mro__[1:] if name in vars(base)), object)
+        replaced = isinstance(vars(base).get(name), FunctionType | classmethod | staticmethod | property)
+        value = vars(kind).get(name)
+        is_method = name not in annotated and (callable(value) or hasattr(value, "__get__"))
+        if replaced and not is_method and base.__module__.startswith(f"{__package__.partition('.')[0]}."):
+            raise ScenarioError(
+                f"{kind.__name__}.{name} would replace the method {name} of {base.__name__}: give it another name, "
+                f"such as {kind.__name__.lower()}_{name}"
+            )
 
 
 def _make_picklable(value: Any) -> None:
