@@ -353,6 +353,18 @@ class Varied(AcrobotScenario):
 
 
 @dataclass
+class Incomplete(AcrobotScenario):
+    mass: float = field(kw_only=True)
+
+
+def test_a_scenario_with_a_field_without_default_is_loaded_neither_by_name_nor_from_a_file(tmp_path):
+    Incomplete(mass=1.0).save(tmp_path / "a.yaml")
+    for source in (f"{__name__}:Incomplete", tmp_path / "a.yaml"):
+        with pytest.raises(ScenarioError, match=r"Incomplete\.mass has no default: give it one"):
+            load_scenario(source)
+
+
+@dataclass
 class Remembering(AcrobotScenario):
     extra: object = None
 

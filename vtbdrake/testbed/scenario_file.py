@@ -9,6 +9,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields
 from inspect import isabstract
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args
@@ -67,7 +68,7 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
     is_file = file.endswith((".yaml", ".yml"))
     if name and not is_file:
         raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
-    scenario = _load_yaml(Path(file), name, key) if is_file else scenario_class(text)()
+    scenario = _load_yaml(Path(file), name, key) if is_file else _with_defaults(scenario_class(text))()
     scenario.validate()
     if scenario.pedigree.reasons:
         reasons = "; ".join(scenario.pedigree.reasons)
@@ -244,7 +245,17 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         schema = scenario_class(named or name)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from error
-    return _filled(schema.blank(), content, path, name)
+    return _filled(_with_defaults(schema).blank(), content, path, name)
+
+
+def _with_defaults(schema: type[Scenario]) -> type[Scenario]:
+    """Return a class of scenarios; raise a ScenarioError if a field has no default."""
+    for item in fields(schema):
+        if item.init and item.default is MISSING and item.default_factory is MISSING:
+            raise ScenarioError(
+                f"{schema.__name__}.{item.name} has no default: give it one, which files and the command line replace"
+            )
+    return schema
 
 
 def read_fields(scenario: S, path: Path, key: str = "") -> S:
