@@ -396,6 +396,10 @@ SMALL = STATED["criteria"]["small angle"]
         ({"seeds": {"draw": "builtins:draw"}}, "builtins has no function 'draw'"),
         ({"seeds": {"draw": "builtins:len"}}, "builtins:len(0) raises TypeError"),
         ({"seeds": {"draw": "builtins:abs"}}, "returns {address: value}, not 0"),
+        (
+            {"conditions": {"free": {ANGLE: float("nan")}}},
+            f"Campaign.conditions[free][{ANGLE}] must be finite, not nan",
+        ),
         ({"horizon": "long"}, "horizon must be a finite number above 0 s, not 'long'"),
         ({"stop": {"above": 1.0}}, "a quality needs at least one quality variable"),
         ({"condition": {}}, "Campaign has no field 'condition'; did you mean conditions?"),
@@ -423,6 +427,12 @@ def test_a_file_that_is_no_campaign_is_refused(tmp_path: Path, text: str, messag
     path.write_text(text)
     printed = error_of("campaign", path)
     assert message in printed and printed.count("pendulum.yaml") == 1
+
+
+def test_names_of_conditions_are_kept_as_they_stand(tmp_path: Path) -> None:
+    path = written(tmp_path, conditions={})
+    path.write_text(path.read_text().replace("conditions: {}", "conditions: {no: {}, 010: {}, 1e-3: {}}"))
+    assert [*Campaign.load(path).conditions] == ["no", "010", "1e-3"]
 
 
 def test_a_missing_file_and_a_missing_rollout_are_named(tmp_path: Path) -> None:

@@ -242,7 +242,7 @@ def _expected(types: Sequence[Any], limits: Setting, value: Any) -> str:
         elif name == "array" and isinstance(value, str):
             noun = f"{noun}, such as [{value!r}]"
         words.append(noun)
-    return " or ".join(dict.fromkeys(words)) or limits.range
+    return " or ".join(dict.fromkeys(words)) or limits.range or "finite"
 
 
 def schema(kind: type) -> dict[str, Any]:

@@ -123,7 +123,14 @@ def scenario_beside(path: Path, scenario: str) -> str:
 
 
 class Loader(yaml.SafeLoader):
-    """Reads 1e-3 as a number, as YAML 1.2 and JSON do."""
+    """Reads 1e-3 as a number, as YAML 1.2 and JSON do, and keys as texts: no, on and 010 are names as they stand."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the content of a mapping, with the texts of its keys."""
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                key.tag = "tag:yaml.org,2002:str"
+        return super().construct_mapping(node, deep)
 
 
 Loader.yaml_implicit_resolvers = {key: [*rows] for key, rows in yaml.SafeLoader.yaml_implicit_resolvers.items()}
