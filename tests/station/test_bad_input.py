@@ -205,7 +205,24 @@ def test_control_mode_that_the_dps_does_not_fit_is_told() -> None:
         vtb.Station(f"{FILE}#Position", dps=lambda station: JointControl(torque=True)).build()
 
 
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (vtb.StationCommand([0.0]), "no input port for the command 'goal'; it has: none. Add it, or leave the command"),
+        ([0.0], r"the command 'goal' is a StationCommand\(default=\[...\]\), not \[0.0\]"),
+    ],
+)
+def test_command_that_the_dps_does_not_take_is_told(command: object, message: str) -> None:
+    station = vtb.Station(
+        f"{FILE}#Torque", dps=lambda station: ports(inputs={}, outputs=FINE), commands={"goal": command}
+    )
+    with pytest.raises(ScenarioError, match=message):
+        station.build()
+
+
 def test_station_without_a_dps_is_told() -> None:
+    with pytest.raises(ValueError, match=r"is called with 1 value \(the station\), but <lambda> takes \(\)"):
+        vtb.Station(f"{FILE}#Torque", dps=lambda: ports(inputs={}, outputs=FINE)).build()
     with pytest.raises(ScenarioError, match="has no DPS: give it dps=, a function"):
         vtb.Station(f"{FILE}#Torque").build()
     with pytest.raises(ScenarioError, match="returns a new System for a station, not 3"):

@@ -19,7 +19,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.argument_checks import check_takes, suggestion
 from vtbdrake.common.settings import setting
 from vtbdrake.control.bridge import acts_idle
 from vtbdrake.control.runtime import Runtime
@@ -212,6 +212,7 @@ class Station(HardwareSimScenario):
                 f"{type(self).__name__} has no DPS: give it dps=, a function of the station that returns a System"
                 + (f"; {self.dps} is none" if self.dps else "")
             )
+        check_takes(function, ["the station"], name=f"the function {self.dps}")
         system = function(self)
         if not isinstance(system, System):
             raise ScenarioError(f"{self.dps} returns a new System for a station, not {system!r}")
@@ -274,6 +275,14 @@ class Station(HardwareSimScenario):
                     f"the DPS has an input port {name!r}, but {self.where('model_drivers')} offers no such sensor "
                     f"signal{suggestion(name, offered)}: rename it, or declare it as a command, "
                     f"commands={{{name!r}: StationCommand(default=[...])}}"
+                )
+        for name, command in self.commands.items():
+            if not isinstance(command, StationCommand):
+                raise ScenarioError(f"the command {name!r} is a StationCommand(default=[...]), not {command!r}")
+            if name not in inputs:
+                raise ScenarioError(
+                    f"the DPS has no input port for the command {name!r}; it has: {', '.join(inputs) or 'none'}. Add "
+                    "it, or leave the command out"
                 )
         return Interface(
             sense=sensors,
