@@ -113,3 +113,27 @@ def test_a_system_whose_methods_compute_its_outputs_is_freed():
     del diagram, system
     gc.collect()
     assert reference() is None
+
+
+@pytest.mark.parametrize(
+    ("quantity", "message"),
+    [
+        (1.0, r"declare gain as gain=Quantity\(default, unit\), not as gain=1.0"),
+        (Quantity("1.5"), "the default of gain must be a number or several, not '1.5'"),
+        (Quantity(5.0, bounds=(0.0, 1.0)), r"the default of gain, 5.0, lies outside its bounds \(0.0, 1.0\)"),
+        (Quantity([0.5, 2.0], bounds=([0.0, 0.0], [1.0, 1.0])), "the default of gain, .* lies outside"),
+        (Quantity(0.5, bounds=(1.0, 0.0)), r"the bounds of gain are \(lower, upper\), not \(1.0, 0.0\)"),
+        (Quantity(0.5, bounds=(0.0, np.nan)), r"the bounds of gain are \(lower, upper\), not \(0.0, nan\)"),
+        (Quantity(0.5, bounds=(0.0, 0.5, 1.0)), r"the bounds of gain are \(lower, upper\), not \(0.0, 0.5, 1.0\)"),
+        (Quantity(0.5, bounds=("0", 1.0)), "each of the bounds of gain must be a number or several, not '0'"),
+        (Quantity([0.5, 0.5], bounds=(0.0, [1.0])), r"numbers or have its shape \(2,\), not \(1,\)"),
+    ],
+)
+def test_a_quantity_that_is_not_possible_is_refused_by_its_name(quantity, message):
+    with pytest.raises(ValueError, match=message):
+        AddressedSystem().declare_parameters(gain=quantity)
+
+
+def test_no_value_and_the_bounds_themselves_are_possible_defaults():
+    vector = NamedVector(force=Quantity(np.nan, bounds=(0.0, 1.0)), gain=Quantity([0.0, 1.0], bounds=(0.0, 1.0)))
+    np.testing.assert_array_equal(vector.array(), [np.nan, 0.0, 1.0])

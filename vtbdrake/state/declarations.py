@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.argument_checks import as_array, suggestion
 
 CONTINUOUS = "continuous"
 DISCRETE = "discrete"
@@ -121,11 +121,14 @@ class NamedVector:
     Attributes:
         quantities: The quantities by name.
         size: Number of entries.
+
+    Raises:
+        ValueError: A default or a bound is no number, or a default lies outside its bounds.
     """
 
     def __init__(self, **quantities: Quantity) -> None:
         self.quantities = quantities
-        self._defaults = {name: np.asarray(quantity.default, dtype=float) for name, quantity in quantities.items()}
+        self._defaults = {name: _checked_default(name, quantity) for name, quantity in quantities.items()}
         starts = np.cumsum([0, *(default.size for default in self._defaults.values())]).tolist()
         self._starts = dict(zip(quantities, starts, strict=False))
         self.size: int = starts[-1]
@@ -160,6 +163,26 @@ class NamedVector:
             if quantity.addressed:
                 shape, start = self._defaults[name].shape, self._starts[name]
                 yield Element(name, group, index, shape, start, quantity.unit, quantity.bounds)
+
+
+def _checked_default(name: str, quantity: Quantity) -> np.ndarray:
+    """Return the default of a quantity as an array; raise a ValueError if it or the bounds are not possible."""
+    if not isinstance(quantity, Quantity):
+        raise ValueError(f"declare {name} as {name}=Quantity(default, unit), not as {name}={quantity!r}")
+    default = as_array(f"the default of {name}", quantity.default)
+    try:
+        lower, upper = quantity.bounds
+    except (TypeError, ValueError):
+        raise ValueError(f"the bounds of {name} are (lower, upper), not {quantity.bounds!r}") from None
+    lower, upper = (as_array(f"each of the bounds of {name}", bound) for bound in (lower, upper))
+    for bound in (lower, upper):
+        if bound.shape not in ((), default.shape):
+            raise ValueError(f"the bounds of {name} are numbers or have its shape {default.shape}, not {bound.shape}")
+    if not np.all(lower <= upper):
+        raise ValueError(f"the bounds of {name} are (lower, upper), not {quantity.bounds!r}")
+    if np.any((default < lower) | (default > upper)):  # NaN is no value, such as no command.
+        raise ValueError(f"the default of {name}, {quantity.default!r}, lies outside its bounds {quantity.bounds!r}")
+    return default
 
 
 def _accessor(start: int, shape: tuple[int, ...]) -> property:
