@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,19 @@ def test_trials_fail_by_their_assertions() -> None:
     text = failure(lambda: assert_succeeds(trial, rate=0.9), plot=False)
     assert "52 of 58 trials succeed" in text and "number 7: AssertionError: seed 7 tips over" in text
     assert_succeeds(trial, rate=0.8, count=200)
+
+
+@pytest.mark.parametrize("false", [False, np.False_, np.array(False), 0])
+def test_trials_fail_by_what_is_false(false: object) -> None:
+    for trials in (lambda seed: false, [false] * 58):
+        assert "0 of 58 trials succeed" in failure(partial(assert_succeeds, trials, rate=0.9), plot=False)
+
+
+@pytest.mark.parametrize("outcome", ["failed", 0.0, np.nan, np.array([True, False]), 2])
+def test_an_outcome_that_is_neither_true_nor_false_is_refused(outcome: object) -> None:
+    for trials in (lambda seed: outcome, [outcome] * 58):
+        with pytest.raises(ValueError, match="the outcome of a trial is True or False, not"):
+            assert_succeeds(trials, rate=0.9)
 
 
 # -- budget

@@ -258,14 +258,14 @@ def assert_succeeds(
 
     Args:
         trials: The outcomes, True for success; or a function of the number of the trial (its seed, say), which fails by
-            an AssertionError or by returning False.
+            an AssertionError or by returning False, and succeeds by returning True or nothing.
         rate: The rate that has to be shown, between 0 and 1.
         confidence: The confidence, between 0 and 1.
         count: Number of calls of the function; by default twice the number of trials that all have to succeed.
 
     Raises:
         AssertionError: The rate is not shown.
-        ValueError: Not even success in all trials would show it.
+        ValueError: Not even success in all trials would show it, or an outcome is neither True nor False.
     """
     __tracebackhide__ = True
     if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0):
@@ -276,12 +276,14 @@ def assert_succeeds(
     if callable(trials):
         for number in range(2 * least if count is None else count):
             try:
-                outcomes.append(trials(number) is not False)
+                returned = trials(number)
             except AssertionError as error:
                 outcomes.append(False)
                 reasons.setdefault(number, error_text(error))
+            else:
+                outcomes.append(True if returned is None else _as_outcome(returned))
     else:
-        outcomes = [bool(outcome) for outcome in trials]
+        outcomes = [_as_outcome(outcome) for outcome in trials]
     if len(outcomes) < least:
         raise ValueError(
             f"{len(outcomes)} trials cannot show a rate of {rate:g} with {confidence:.4g} confidence, even if all "
@@ -299,6 +301,13 @@ def assert_succeeds(
         f"confidence, not {rate:g}; {len(failed)} fail{first}{because}",
         name="succeeds",
     )
+
+
+def _as_outcome(value: object) -> bool:
+    outcome = value.item() if isinstance(value, np.ndarray | np.generic) and value.size == 1 else value
+    if isinstance(outcome, int) and outcome in (0, 1):
+        return bool(outcome)
+    raise ValueError(f"the outcome of a trial is True or False, not {value!r}")
 
 
 def assert_replays(log: ControlLog | str | os.PathLike[str], *, target: Target | None = None) -> None:
