@@ -221,6 +221,7 @@ def test_a_problem_that_makes_no_sense_is_refused(changes, message):
         (lambda p: p.sweep(points=3.5), "a number of points must be a whole number, not 3.5"),
         (lambda p: p.sweep(points="3"), "give points as one whole number, .* not as '3'"),
         (lambda p: p.sweep(values="fast"), r"numbers of shape \(n, p\), not 'fast'"),
+        (lambda p: p.sweep(values=["1.5"]), r"numbers of shape \(n, p\), not \['1.5'\]"),
         (lambda p: p.sweep(points=3, executor="threads", workers=1.5), "workers must be a whole number, not 1.5"),
         (lambda p: p.rollout([1.0], condition=1), "no condition 1: it has 1"),
         (lambda p: p.rollout([1.0], condition=-1), "no condition -1"),

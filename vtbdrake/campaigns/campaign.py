@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.campaigns.results import ALL, CampaignResult, CampaignRollout, RolloutName
+from vtbdrake.common.argument_checks import as_result
 from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.common.settings import setting
 from vtbdrake.optimization import Motion, Problem, Study
@@ -393,7 +394,7 @@ class Campaign(StatedRollouts):
     def _samples(self, criterion: Criterion, result: RolloutResult) -> np.ndarray:
         columns = [result.record.get(address, ()) for address in criterion.addresses]
         try:
-            return np.array([criterion.function()(*row) for row in zip(*columns, strict=True)], dtype=float)
+            return np.array([as_result(criterion.function()(*row)) for row in zip(*columns, strict=True)])
         except FAILURES:  # It has failed the rollout, whose message names it.
             return np.array([])
 

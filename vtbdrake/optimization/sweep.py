@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake import upper_layers
-from vtbdrake.common.argument_checks import all_of, as_whole, check_plain, counted
+from vtbdrake.common.argument_checks import all_of, as_array, as_whole, check_plain, counted
 from vtbdrake.common.extras import extra_module
 from vtbdrake.common.json_data import plain
 from vtbdrake.common.summary_html import summary_html
@@ -383,9 +383,9 @@ def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
         ValueError: They have another shape, or are no numbers.
     """
     try:
-        table = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"the values of a sweep are numbers of shape (n, p), not {values!r}") from error
+        table = as_array("the values of a sweep", values)
+    except ValueError:
+        raise ValueError(f"the values of a sweep are numbers of shape (n, p), not {values!r}") from None
     count = len(parameters)
     if table.ndim < 2 and (count == 1 or not table.size):
         table = table.reshape(-1, count)
