@@ -143,6 +143,7 @@ def test_missing_extra_is_named(gemm: Path, monkeypatch: pytest.MonkeyPatch) -> 
         ({"period": 0.0}, "period is positive and finite, in s, not 0.0"),
         ({"initial": {"v": 0.0}}, "initial names 'v', but the output ports are 'u'"),
         ({"initial": {"u": [np.nan, 0.0]}}, "initial of u is one finite number, or 2 of them"),
+        ({"initial": {"u": ["1", "2"]}}, "initial of u must be a number or several, not .'1', '2'"),
     ],
 )
 def test_arguments_that_do_not_fit_are_refused(gemm: Path, changes: dict[str, Any], message: str) -> None:

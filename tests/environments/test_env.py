@@ -247,6 +247,7 @@ def test_wrong_options_are_refused(env: TestbedEnv, options: dict[str, Any], mes
         ([1.0, 2.0], r"an action takes numbers for force, in the shape \(1,\), not \(2,\)"),
         ([[1.0]], r"in the shape \(1,\), not \(1, 1\)"),
         ("left", "an action takes numbers for force, not 'left'"),
+        (["1.5"], r"an action takes numbers for force, not \['1.5'\]"),
     ],
 )
 def test_wrong_actions_are_refused_and_nothing_happens(env: TestbedEnv, action: Any, message: str) -> None:

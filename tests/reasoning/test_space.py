@@ -50,6 +50,7 @@ def test_a_rate_limited_plan_goes_on_from_the_one_in_use():
         ({"u.plan": [5.0, 0.0, 2.0, 40.0, 4.0]}, r"u\.plan\[3\] = 40 lies outside its range \[-10, 10\]"),
         ({"u.plan": 3.0}, r"a plan of u.plan is \[t_begin, knots\], 5 finite numbers, not 3.0"),
         ({"u.plan": [np.nan, 1.0, 2.0, 3.0, 4.0]}, "5 finite numbers, not .nan"),
+        ({"u.plan": ["0", "1", "2", "3", "4"]}, "a plan of u.plan must be a number or several, not .'0', '1'"),
     ],
 )
 def test_a_plan_that_cannot_be_decided_is_refused(change, message):

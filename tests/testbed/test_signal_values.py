@@ -148,3 +148,8 @@ def test_commands_of_the_testbeds_are_enumerations(scenario: str, command: str, 
     [signal] = [s for s in load_scenario(f"vtbdrake_diagrams.{scenario}").interface().commands if s.name == command]
     assert len(list(signal.values or ())) == count
     assert Bounds(signal).violation([0.5]) == "values" and Bounds(signal).violation(signal.default_vector()) == ""
+
+
+def test_texts_are_no_values_of_a_signal():
+    with pytest.raises(SignalError, match=r"signal force has 2 numbers, not \['1', '2'\]"):
+        Signal("force", size=2).check_value(["1", "2"])

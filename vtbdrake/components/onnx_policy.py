@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, DiscreteValues, InputPort
 
-from vtbdrake.common.argument_checks import as_number, as_whole
+from vtbdrake.common.argument_checks import as_array, as_number, as_whole
 from vtbdrake.common.extras import extra_module
 from vtbdrake.common.failures import one_line
 from vtbdrake.components.casadi_system.handler import gather, handler
@@ -297,7 +297,7 @@ def _ports(argument: str, tensors: Mapping[str, Mapping[str, int]]) -> dict[str,
 
 
 def _initial(port: str, size: int, value: ArrayLike) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = as_array(f"OnnxPolicy: initial of {port}", value)
     if array.shape not in ((), (size,)) or not np.isfinite(array).all():
         raise ValueError(f"OnnxPolicy: initial of {port} is one finite number, or {size} of them, not {value!r}")
     return np.array(np.broadcast_to(array, (size,)))

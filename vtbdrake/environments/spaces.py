@@ -105,8 +105,8 @@ class Channels:
         """
         shape = self.lower.shape if count is None else (count, *self.lower.shape)
         try:
-            array = np.asarray(actions, dtype=float)
-        except (TypeError, ValueError):
+            array = as_array("an action", actions)
+        except ValueError:
             raise ActionError(f"{self._shape_text(count)}, not {actions!r}") from None
         if array.shape != shape:
             raise ActionError(f"{self._shape_text(count)}, in the shape {shape}, not {array.shape}")

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.common.argument_checks import as_whole
+from vtbdrake.common.argument_checks import as_array, as_whole
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.spline import Spline
 from vtbdrake.optimization.parameter import Parameter
@@ -146,7 +146,7 @@ class Trajectory:
             ValueError: It has another size, or is not finite.
         """
         count = 1 + self.spline.knots * self.size
-        numbers = np.asarray(plan, dtype=float)
+        numbers = as_array(f"a plan of {self.address}", plan)
         if numbers.shape != (count,) or not np.isfinite(numbers).all():
             raise ValueError(f"a plan of {self.address} is [t_begin, knots], {count} finite numbers, not {plan!r}")
         return numbers.tolist()

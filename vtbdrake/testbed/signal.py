@@ -192,9 +192,9 @@ class Signal:
         """Raise a SignalError if ``value`` has another size or type than the signal, or a NaN."""
         if self.is_vector:
             try:
-                array = np.asarray(value, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise SignalError(f"signal {self.name} has {self.size} numbers, not {value!r}") from error
+                array = as_array(f"signal {self.name}", value)
+            except ValueError:
+                raise SignalError(f"signal {self.name} has {self.size} numbers, not {value!r}") from None
             if array.shape != (self.size,):
                 raise SignalError(f"signal {self.name} has {self.size} entries, not the shape {array.shape}")
             if np.isnan(array).any():

@@ -168,6 +168,8 @@ def test_every_value_is_a_variable() -> None:
     ("values", "message"),
     [
         ({"limit": -1.0}, "limit must not be negative"),
+        ({"limit": "5"}, "JointDrives: limit must be a number or several, not '5'"),
+        ({"initial": ["1", "2"]}, "JointDrives: initial must be a number or several, not .'1', '2'"),
         ({"viscous": [0.0, np.nan]}, "viscous must not be negative or NaN"),
         ({"load_friction": -0.1}, "load_friction must not be negative"),
         ({"disturbance": [1.0, -1.0]}, "disturbance must not be negative"),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from vtbdrake.common.argument_checks import as_array
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel, clamp
 from vtbdrake.components.sensors.noise import normal_noise, random_stream
 from vtbdrake.state import AddressedSystem, Quantity
@@ -131,7 +132,7 @@ class JointDrives(AddressedSystem):
             disturbance,
         )  # fmt: skip
         numbers = zip(_UNITS, by_joint, strict=True)
-        entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in numbers}
+        entries = {name: np.broadcast_to(as_array(f"JointDrives: {name}", value), (n,)) for name, value in numbers}
         self.max_delay = max(int(delay), int(max_delay))
         times = {"time_constant": np.array(time_constant), "disturbance_time": np.array(disturbance_time)}
         _check(period, {**entries, **times, "seed": np.array(seed), "delay": np.array(delay)})
@@ -140,7 +141,7 @@ class JointDrives(AddressedSystem):
         self.entry_names = tuple(joint.name() for joint in joints)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        self._declare_state(np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,))))
+        self._declare_state(np.array(np.broadcast_to(as_array("JointDrives: initial", initial), (n,))))
         self.settings = self.declare_parameters(
             **{name: Quantity(value, _UNITS[name], (_lowest(name), inf)) for name, value in entries.items()},
             inertia=Quantity(least_inertia(plant, joints), "kg m^2", (0.0, inf)),
