@@ -126,7 +126,12 @@ class Loader(yaml.SafeLoader):
     """Reads 1e-3 as a number, as YAML 1.2 and JSON do, and keys as texts: no, on and 010 are names as they stand."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the content of a mapping, with the texts of its keys."""
+        """Return the content of a mapping, with the texts of its keys.
+
+        Args:
+            node: The mapping.
+            deep: Whether its values are constructed at once.
+        """
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 key.tag = "tag:yaml.org,2002:str"
