@@ -106,6 +106,19 @@ def test_limited_rate_without_continuity_is_refused() -> None:
             Deployment(continuity=CONTINUITY, guards={"fallback": {"velocity": Hold}}),
             "a Fallback, Zero() say, not <class",
         ),
+        *(
+            (Deployment(continuity=CONTINUITY, guards={option: value}), reason)
+            for option, value, reason in (
+                ("fallback", {"velocity": 0.0}, "the fallback of velocity is a Fallback, Zero() say, not 0.0"),
+                ("falback", {}, "the guards have no setting 'falback'; did you mean fallback?"),
+                ("max_delay", {"speed": "0.1"}, "the max_delay of speed must be a number, not '0.1'"),
+                ("jump_tolerance", {"speed": "0.1"}, "speed must be a number or several, not '0.1'"),
+                ("acting_latency", "3", "acting_latency must be a number, not '3'"),
+                ("acting_tolerance", {"velocity": "3"}, "velocity must be a number or several, not '3'"),
+                ("leave_time", "3", "leave_time must be a number, not '3'"),
+                ("max_missed", None, "max_missed must be a number, not None"),
+            )
+        ),
         (Deployment(continuity=CONTINUITY, protocol=Protocol(sense=[], act=[])), "position"),
         (Deployment(continuity=CONTINUITY, pace="posture"), "(position, speed), not by 'posture'"),
     ],
@@ -159,6 +172,13 @@ def test_refused_reset_says_what_to_do(hint: str, expected: str) -> None:
     machine.runtime.run(cycles=2)
     with pytest.raises(SwitchRefusedError, match=f"1.2 is allowed: .*{expected}"):
         machine.runtime.reset()
+
+
+@pytest.mark.parametrize("field", ["period", "patience"])
+@pytest.mark.parametrize("value", ["0.01", None, 0.0, np.nan])
+def test_times_of_a_loop_are_positive_numbers(field: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"the {field} of a loop .* not {value!r}"):
+        Deployment(**{field: value})
 
 
 def test_fields_of_a_deployment_can_be_replaced() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.argument_checks import as_number
 from vtbdrake.control.acting import ActingMonitor
 from vtbdrake.control.fallback import Fallback, chain, default_fallback, is_position
 from vtbdrake.control.fault import FaultKind
@@ -167,17 +168,18 @@ def guarded_signal(
     Raises:
         ValueError: The fallback, the latency or the tolerance does not fit the signal.
     """
+    first = default_fallback(signal) if fallback is None else fallback
     return GuardedSignal(
         name=signal.name,
         limiter=RateLimiter(signal, period=period) if signal.is_vector else PassThrough(),
         acting=_acting_monitor(signal, period, latency, tolerance) if signal.is_vector else None,
-        fallbacks=tuple(chain(fallback or default_fallback(signal), signal, interface=interface)),
+        fallbacks=tuple(chain(first, signal, interface=interface)),
         is_position=is_position(signal),
     )
 
 
 def _acting_monitor(signal: Signal, period: float, latency: float, tolerance: ArrayLike | None) -> ActingMonitor:
-    if not 1.0 <= latency <= LARGEST_ACTING_LATENCY:
+    if not 1.0 <= as_number("acting_latency", latency) <= LARGEST_ACTING_LATENCY:
         raise ValueError(f"acting_latency is 1 to {LARGEST_ACTING_LATENCY} periods, not {latency}")
     if tolerance is None:
         step = 0.5 * signal.vector(signal.rate) * period

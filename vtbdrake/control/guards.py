@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.argument_checks import as_number
 from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample
 from vtbdrake.control.fault import Fault, FaultKind
@@ -601,11 +602,11 @@ class Guards:
 
 
 def _check_allowances(max_missed: float, pace_tolerance: float, leave_time: float) -> None:
-    if isnan(max_missed) or max_missed < 0:
+    if isnan(as_number("max_missed", max_missed)) or max_missed < 0:
         raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
-    if not pace_tolerance > 0.0:
+    if not as_number("pace_tolerance", pace_tolerance) > 0.0:
         raise ValueError(f"pace_tolerance is a positive share of the period, not {pace_tolerance}")
-    if not leave_time >= 0.0:
+    if not as_number("leave_time", leave_time) >= 0.0:
         raise ValueError(f"leave_time is a number of seconds from 0 on, not {leave_time}")
 
 

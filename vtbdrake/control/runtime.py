@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.argument_checks import as_number
 from vtbdrake.common.closing import Closing
 from vtbdrake.common.failures import FAILURES
 from vtbdrake.common.interrupt import interrupts_postponed
@@ -522,11 +523,11 @@ class Runtime(Closing, Stepped):
 
 
 def _check_pace(bridge: Bridge, clock: Clock | None, *, period: float, pace: str | None, patience: float) -> None:
-    if not (0.0 < period < inf):
+    if not (0.0 < as_number("the period of a loop", period) < inf):
         raise ValueError(f"the period of a loop is positive and finite, not {period} s")
     if pace is not None and pace not in bridge.sensed:
         raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
-    if not (0.0 < patience < inf):
+    if not (0.0 < as_number("the patience of a loop", patience) < inf):
         raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {patience}")
     if pace is not None and bridge.real_time and isinstance(clock, SimulatedClock):
         raise ValueError(

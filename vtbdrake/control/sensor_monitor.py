@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.argument_checks import as_number
 from vtbdrake.control.fault import Fault, FaultKind
 from vtbdrake.control.limits import Bounds, JumpBounds
 from vtbdrake.control.received_signal import ReceivedSignal
@@ -77,7 +78,7 @@ class SensorMonitor(StalenessMonitor):
     def __init__(
         self, signal: Signal, *, jump_tolerance: ArrayLike | None = None, max_delay: float | None = None
     ) -> None:
-        if max_delay is not None and not max_delay > 0.0:
+        if max_delay is not None and not as_number(f"the max_delay of {signal.name}", max_delay) > 0.0:
             raise ValueError(f"the sensor signal {signal.name} has a positive max_delay, not {max_delay} s")
         super().__init__(signal.max_age)
         self.signal = signal

@@ -7,11 +7,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from math import ceil, inf
 from typing import Any, Self
 
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.argument_checks import as_number, suggestion
 from vtbdrake.common.interrupt import termination_interrupts
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guards import ACTING_LATENCY, Guards
@@ -91,8 +93,10 @@ class Deployment:
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.period < inf:
+        if not 0.0 < as_number("the period of a loop", self.period) < inf:
             raise ValueError(f"the period of a loop is positive and finite, not {self.period} s")
+        if not 0.0 < as_number("the patience of a loop", self.patience) < inf:
+            raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {self.patience}")
 
     @classmethod
     def of(cls, scenario: Scenario, **changes: Any) -> Self:
@@ -152,11 +156,14 @@ class Deployment:
 
     def _guards(self, interface: Interface) -> Guards:
         options = dict(self.guards)
+        known = list(signature(Guards).parameters)[2:]
+        for name in options:
+            if name not in known:
+                raise ValueError(f"the guards have no setting {name!r}{suggestion(name, known)}")
         if self.protocol is not None:
             # Between two reports, the newest one becomes older.
-            options["acting_latency"] = options.get("acting_latency", ACTING_LATENCY) + self._report_cycles(
-                self.protocol
-            )
+            latency = as_number("acting_latency", options.get("acting_latency", ACTING_LATENCY))
+            options["acting_latency"] = latency + self._report_cycles(self.protocol)
         if not self.check_age:
             interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
             options.pop("max_delay", None)

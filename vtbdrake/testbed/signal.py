@@ -162,7 +162,7 @@ class Signal:
     def vector(self, value: ArrayLike) -> np.ndarray:
         """Return ``value`` (a scalar or one per entry) as an array of shape (size,)."""
         assert self.size is not None
-        return np.array(np.broadcast_to(np.asarray(value, dtype=float), (self.size,)))
+        return np.array(np.broadcast_to(as_array(f"a value of the signal {self.name}", value), (self.size,)))
 
     def default_vector(self) -> np.ndarray:
         """Return the default of a command as an array of shape (size,)."""
