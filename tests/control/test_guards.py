@@ -12,6 +12,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from vtbdrake.control.bridge import acts_idle
 from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
 from vtbdrake.control.guards import GuardDecision, Guards, LoopCondition
 from vtbdrake.control.received_signal import ReceivedSignal
@@ -860,3 +861,15 @@ def test_sent_command_is_always_one_step_from_acting_command(
             if sent and not lost:
                 assert (abs(sent["torque"] - acting) <= RATE * T + 1e-12).all()
                 acting, heard = sent["torque"], loop.now
+
+
+@pytest.mark.parametrize(
+    ("idle", "message"),
+    [
+        ("0", "idle command of torque must be a number or several, not '0'"),
+        ([0.0, np.nan], "idle command of torque is"),
+    ],
+)
+def test_an_idle_command_that_no_machine_reports_is_refused(idle, message):
+    with pytest.raises(ValueError, match=message):
+        acts_idle({"torque": idle})

@@ -180,9 +180,10 @@ def test_fallback_ends_when_the_machine_confirms():
     assert len(bridge.sent) == 25
 
 
-def test_machine_that_cannot_be_asked_is_brought_to_rest(caplog):
+@pytest.mark.parametrize("released_by", [lambda: {}["brakes"], lambda: "no", lambda: None])
+def test_machine_that_cannot_be_asked_is_brought_to_rest(caplog, released_by):
     guards = Guards(ServoScenario(rate=20.0).interface(), PERIOD, leave_time=0.1)
-    runtime, bridge, _ = switched(rate=20.0, guards=guards, released_by=lambda: {}["brakes"])
+    runtime, bridge, _ = switched(rate=20.0, guards=guards, released_by=released_by)
     runtime.run(cycles=60)
     assert np.abs(sent(bridge)[-1]).min() > 0.4
     runtime.leave("the loop ended")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.common.argument_checks import as_array
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.robot_mode import ReportedMode, RobotMode
 
@@ -136,8 +137,14 @@ def acts_idle(idle: Mapping[str, ArrayLike]) -> Callable[[Bridge], bool]:
     Args:
         idle: The idle command by actuator signal, a scalar or one per entry; all of them have to act. Without any, the
             machine never confirms.
+
+    Raises:
+        ValueError: An idle command is no number, or NaN.
     """
-    return partial(_acts_idle, {name: np.asarray(value, dtype=float) for name, value in idle.items()})
+    commands = {name: as_array(f"the idle command of {name}", value) for name, value in idle.items()}
+    if unknown := [name for name, value in commands.items() if np.isnan(value).any()]:
+        raise ValueError(f"the idle command of {unknown[0]} is NaN, which no machine reports")
+    return partial(_acts_idle, commands)
 
 
 def _acts_idle(idle: Mapping[str, NDArray[np.float64]], bridge: Bridge) -> bool:

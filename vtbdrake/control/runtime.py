@@ -394,6 +394,8 @@ class Runtime(Closing, Stepped):
         """Return whether the machine needs no fallback: it does without commands, or another publisher commands it."""
         try:
             released = self.released_by()
+            if not isinstance(released, bool | np.bool_):  # The text "no" would count as true.
+                raise TypeError(f"released_by returns True or False, not {released!r}")
         except FAILURES:
             released = False  # It does not confirm anything; the fallbacks go on.
             self._log_release(_log.exception, "released_by raised, so the machine is not taken for released")
