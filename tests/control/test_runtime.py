@@ -396,6 +396,13 @@ def test_switch_to_unconnected_or_unready_machine_is_refused():
     assert "the bridge is not connected" in reasons and "its brakes are closed" in reasons
 
 
+@pytest.mark.parametrize("answer", [False, True, 3])
+def test_machine_that_does_not_say_why_it_is_blocked_is_not_commanded(answer):
+    runtime, _, _ = make(rate=0.0, blocked_by=lambda: answer)
+    runtime.cycle()
+    assert f"blocked_by returns the reason as a text, or None, not {answer}" in refusal(runtime)
+
+
 def test_outdated_preparation_is_refused():
     runtime, _, _ = make(rate=0.0)
     runtime.cycle()
