@@ -399,6 +399,8 @@ def test_slow_parts_are_found_in_the_dps():
         ({"latency": -1.0}, "latency of a slow part is finite, and at least 1e-06, not -1.0"),
         ({"latency": np.nan}, "latency of a slow part is finite, and at least 1e-06, not nan"),
         ({"offset": -0.1}, "not at -0.1 s"),
+        ({"period": "0.1"}, "the period of a slow part must be a number, not '0.1'"),
+        ({"initial": {"y": ["1.5"]}}, "y: an array of numbers is expected here, not ['1.5']"),
         ({"latency": 17 * PERIOD}, "17 samples of a slow part would be under way"),
         ({"patience": 0.0}, "patience of a slow part is finite, and at least 1e-06, not 0.0"),
         ({"inputs": {}}, "at least one input"),
@@ -428,7 +430,8 @@ def test_a_slow_part_that_cannot_be_is_refused(changed, told):
         (lambda t: {"z": t}, {}, "a slow part returns its outputs by name (y), not z"),
         (lambda t: t, {"outputs": {"y": 1, "z": 1}}, "a slow part returns its outputs by name (y, z), not array([0.])"),
         (lambda t: np.zeros(3), {}, "y: an array of shape (1,) is expected here, not one of shape (3,)"),
-        (lambda t: "?", {}, "y: could not convert"),
+        (lambda t: ["1.5"], {}, "y: an array of numbers is expected here, not ['1.5']"),
+        (lambda t: "?", {}, "y: an array of numbers is expected here, not '?'"),
         (lambda t, memory: t, {"memory": np.zeros(1)}, "returns (outputs, memory), not array([0.])"),
     ],
 )

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, EventStatus, InputPort, State
 
+from vtbdrake.common.argument_checks import as_number
 from vtbdrake.drake_workarounds.event_times import SAMPLED_EARLY, SHOWN_EARLY
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.codecs import array_codec, codec_of
@@ -401,9 +402,9 @@ def _codec(name: str, model: Any) -> Codec:
 
 def _check_times(period: float, latency: float, offset: float, patience: float) -> None:
     for name, value in {"period": period, "latency": latency, "patience": patience}.items():
-        if not _SHORTEST <= value < inf:
+        if not _SHORTEST <= as_number(f"the {name} of a slow part", value) < inf:
             raise ValueError(f"the {name} of a slow part is finite, and at least {_SHORTEST:g}, not {value}")
-    if not 0.0 <= offset < inf:
+    if not 0.0 <= as_number("the offset of a slow part", offset) < inf:
         raise ValueError(f"a slow part begins at a finite time that is not negative, not at {offset} s")
 
 
