@@ -121,6 +121,7 @@ def test_a_plan_that_is_not_finite_is_an_error(begin: float, first: float) -> No
         ({"period": PERIOD, "size": 0}, "at least one entry, not 0"),
         ({"period": PERIOD, "size": 2, "after": [1.0, 2.0, 3.0]}, "or 2 of them"),
         ({"period": PERIOD, "after": float("nan")}, "one finite number"),
+        ({"period": PERIOD, "after": "1.5"}, "SplineCommand: after must be a number or several, not '1.5'"),
     ],
 )
 def test_bad_declarations_are_refused(options: dict[str, Any], message: str) -> None:

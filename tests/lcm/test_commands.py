@@ -180,7 +180,12 @@ def test_command_message_keeps_the_order_of_its_sender() -> None:
 
 @pytest.mark.parametrize(
     ("value", "sender", "message"),
-    [(1.0, "a", r"a vector, not of shape \(\)"), ([1.0], "", "1 to 64 characters, not 0"), ([1.0], "a" * 65, "not 65")],
+    [
+        (1.0, "a", r"a vector, not of shape \(\)"),
+        (["1.5"], "a", r"the value of a command must be a number or several, not \['1.5'\]"),
+        ([1.0], "", "1 to 64 characters, not 0"),
+        ([1.0], "a" * 65, "not 65"),
+    ],
 )
 def test_bad_command_message_is_refused(value: object, sender: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -351,7 +351,29 @@ def test_an_uncertainty_that_does_not_fit_is_refused(tracked, uncertainty, why):
         BeliefToStart(tracked[2], uncertainty=uncertainty)
 
 
+def test_a_drawn_text_is_no_number(tracked):
+    testbed, context, mental = tracked
+    to_start = BeliefToStart(mental, uncertainty={OMEGA: lambda w, rng: "0.5"})
+    with pytest.raises(ValueError, match=f"what was drawn for {OMEGA} must be a number or several, not '0.5'"):
+        to_start.starts(Belief.of(testbed, context), samples=2)
+
+
+@dataclass
+class TextScenario(TrackedScenario):
+    """The mass of the arm is believed by a rule that returns a text."""
+
+    def add_world(self, builder):
+        super().add_world(builder)
+        builder.believe(ARM_MASS, of=["dps.angle"], by=lambda angle: "1.5")
+
+
 # -- beliefs from which nothing can begin
+
+
+def test_a_believed_text_is_no_number():
+    testbed = TextScenario().build()
+    with pytest.raises(BeliefError, match=f"{ARM_MASS} takes numbers of shape .*, but '1.5' is believed"):
+        BeliefToStart(testbed).start(Belief.of(testbed, testbed.default_context()))
 
 
 def test_a_missing_belief_or_one_out_of_bounds_is_refused(tracked):

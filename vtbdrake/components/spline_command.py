@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.common.argument_checks import as_array
 from vtbdrake.common.spline import Spline
 from vtbdrake.state import AddressedSystem, Quantity
 
@@ -95,7 +96,7 @@ class SplineCommand(AddressedSystem):
 
 
 def _vector(name: str, value: ArrayLike, size: int) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = as_array(f"SplineCommand: {name}", value)
     if array.shape not in ((), (size,)) or not np.isfinite(array).all():
         raise ValueError(f"SplineCommand: {name} is one finite number, or {size} of them, not {value!r}")
     return np.array(np.broadcast_to(array, (size,)))

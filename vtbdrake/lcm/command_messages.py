@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.argument_checks import as_array
 from vtbdrake.control.message_order import LONGEST_SENDER
 from vtbdrake.lcm.lcm_types.lcmt_vtb_command import lcmt_vtb_command
 from vtbdrake.lcm.maps import VectorMap, vector_map
@@ -38,9 +38,9 @@ def command_message(value: ArrayLike, *, sender: str, utime: int | None = None) 
         utime: The time on the sender's clock in microseconds; by default now, on a clock that never goes back.
 
     Raises:
-        ValueError: The value is no vector, or the sender's name is empty or longer than 64 characters.
+        ValueError: The value is no vector of numbers, or the sender's name is empty or longer than 64 characters.
     """
-    vector = np.asarray(value, dtype=float)
+    vector = as_array("the value of a command", value)
     if vector.ndim != 1:
         raise ValueError(f"the value of a command is a vector, not of shape {vector.shape}")
     if not 0 < len(sender) <= LONGEST_SENDER:

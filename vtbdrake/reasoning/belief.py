@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 
-from vtbdrake.common.argument_checks import as_whole
+from vtbdrake.common.argument_checks import as_array, as_whole
 from vtbdrake.rollout.start import Start
 from vtbdrake.state import Variable, VariableError
 from vtbdrake.state.layout import FlatState, LayoutError
@@ -325,7 +325,7 @@ class BeliefToStart:
 
     def _drawn(self, address: str, value: ArrayLike) -> np.ndarray:
         variable = self._variables[address]
-        drawn = np.asarray(value, dtype=float)
+        drawn = as_array(f"what was drawn for {address}", value)
         if drawn.shape != variable.shape or not np.isfinite(drawn).all():
             raise BeliefError(
                 f"{address} takes finite numbers of shape {variable.shape}, but {value!r} was drawn for it"
@@ -517,8 +517,8 @@ class _Target:
         """
         variable, (least, most) = self.variable, self.ends
         try:
-            believed = np.asarray(value, dtype=float).reshape(variable.shape)
-        except (TypeError, ValueError) as error:
+            believed = as_array(variable.address, value).reshape(variable.shape)
+        except ValueError as error:
             raise BeliefError(
                 f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, "
                 f"of {_plain(basis)}"

@@ -345,6 +345,7 @@ _STATE = {"x": [0.0, 0.0]}
         ({"output": _OUTPUT, "time": "u"}, "time is a scalar, but the argument 'u' is 2x1"),
         ({"output": _OUTPUT, "units": {"u": "m"}}, "units of 'u': no such argument; there are none"),
         ({"output": _OUTPUT, "parameters": {"u": [1, 2, 3]}}, r"has a value of shape \(3,\), but is 2x1"),
+        ({"output": _OUTPUT, "parameters": {"u": ["1", "2"]}}, r"'u' must be a number or several, not \['1', '2'\]"),
         ({"output": _OUTPUT, "state": _STATE}, "the state 'x' never changes: give update"),
         ({"output": _OUTPUT, "period": 0.1}, "period is 0.1 s, but there is no update"),
         ({"update": _UPDATE, "state": _STATE}, "period is None s, but update needs a positive one"),

@@ -11,6 +11,7 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.common.argument_checks import as_array
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel
 from vtbdrake.state import declarations
 from vtbdrake.state.declarations import Element
@@ -266,7 +267,7 @@ def _check_disjoint(roles: Mapping[str, Iterable[str]]) -> None:
 
 
 def _flat(role: str, name: str, value: ArrayLike, shape: Shape) -> NDArray[np.float64]:
-    array = np.asarray(value, dtype=float)
+    array = as_array(f"{role} {name!r}", value)
     accepted = {shape} | ({(max(shape),)} if 1 in shape else set()) | ({()} if shape == (1, 1) else set())
     if array.shape not in accepted:
         raise ValueError(f"{role} {name!r} has a value of shape {array.shape}, but is {_size(shape)}.")
