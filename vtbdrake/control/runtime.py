@@ -413,7 +413,7 @@ class Runtime(Closing, Stepped):
     def blocked_reason(self) -> str | None:
         """Return the reason why the machine must not be commanded (not ready, or out of reach), or None."""
         mode = self.bridge.robot_mode
-        reason = self.bridge.blocked_reason or (mode and mode.blocked_reason) or self.blocked_by()
+        reason: object = self.bridge.blocked_reason or (mode and mode.blocked_reason) or self.blocked_by()
         if reason is None or isinstance(reason, str):
             return reason
         return f"blocked_by returns the reason as a text, or None, not {reason!r}"
