@@ -222,7 +222,14 @@ class Station(HardwareSimScenario):
         """Return the DPS: ``impl``, and an end for the sensor signals that it does not read."""
         interface, builder = self.interface(), DiagramBuilder()
         impl = builder.AddNamedSystem("impl", self.make_impl())
-        unread = [signal for signal in interface.sense if not impl.HasInputPort(signal.name)]
+        inputs = [impl.get_input_port(i).get_name() for i in range(impl.num_input_ports())]
+        for signal in interface.commands:
+            if signal.name not in inputs:
+                raise ScenarioError(
+                    f"the DPS has no input port for the command {signal.name!r}; it has: "
+                    f"{', '.join(inputs) or 'none'}. Add it, or leave the command out"
+                )
+        unread = [signal for signal in interface.sense if signal.name not in inputs]
         for signal in [*interface.sense, *interface.commands]:
             if signal not in unread:
                 builder.ExportInput(impl.GetInputPort(signal.name), signal.name)
@@ -279,11 +286,6 @@ class Station(HardwareSimScenario):
         for name, command in self.commands.items():
             if not isinstance(command, StationCommand):
                 raise ScenarioError(f"the command {name!r} is a StationCommand(default=[...]), not {command!r}")
-            if name not in inputs:
-                raise ScenarioError(
-                    f"the DPS has no input port for the command {name!r}; it has: {', '.join(inputs) or 'none'}. Add "
-                    "it, or leave the command out"
-                )
         return Interface(
             sense=sensors,
             act=[signal for name, signal in actuators.items() if name in outputs],
