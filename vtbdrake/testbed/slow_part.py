@@ -199,6 +199,8 @@ class SlowPart(AddressedSystem):
         self.codecs = {int(self._progress): PROGRESS_CODEC}
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, self.sampled(0), self._sample)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, self.due(0), self._show)
+        # These events come before the instants of others, to which the samples of a rollout belong.
+        self.timings = ()
 
     @property
     def groups(self) -> Mapping[str, int]:
