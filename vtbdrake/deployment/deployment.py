@@ -156,10 +156,10 @@ class Deployment:
 
     def _guards(self, interface: Interface) -> Guards:
         options = dict(self.guards)
-        known = list(signature(Guards).parameters)[2:]
+        settings = list(signature(Guards).parameters)[2:]
         for name in options:
-            if name not in known:
-                raise ValueError(f"the guards have no setting {name!r}{suggestion(name, known)}")
+            if name not in settings:
+                raise ValueError(f"the guards have no setting {name!r}{suggestion(name, settings)}")
         if self.protocol is not None:
             # Between two reports, the newest one becomes older.
             latency = as_number("acting_latency", options.get("acting_latency", ACTING_LATENCY))

@@ -64,10 +64,10 @@ def array_codec(shape: tuple[int, ...], dtype: Any = float) -> Codec:
     """
 
     def encode(value: Any) -> dict[str, np.ndarray]:
-        given = np.asarray(value)
-        if given.dtype.kind in "US" and np.dtype(dtype).kind in "fiub":  # numpy would read the texts.
+        unconverted = np.asarray(value)
+        if unconverted.dtype.kind in "US" and np.dtype(dtype).kind in "fiub":  # numpy would read the texts.
             raise ValueError(f"an array of numbers is expected here, not {value!r}")
-        array = np.asarray(given, dtype=dtype)
+        array = np.asarray(unconverted, dtype=dtype)
         if array.shape != shape:
             raise ValueError(f"an array of shape {shape} is expected here, not one of shape {array.shape}")
         return {"": array}
