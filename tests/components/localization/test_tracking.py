@@ -427,6 +427,41 @@ def test_match_that_may_be_a_stray_is_weighed():
     np.testing.assert_allclose(after.pose_covariance[:2, :2], expected, rtol=0.01, atol=1e-4)
 
 
+def test_pair_that_contradicts_another_lowers_its_probability():
+    """The mixture is computed by hand: one detection is as far to one side of its landmark as the other to the other.
+
+    They share neither detection nor landmark, but only one of them can be right, or none is.
+    """
+    density, deviation, prior, aside = 0.5, 0.05, 0.4, np.array([0.3, 0.2])
+    tracker, state, places = two_landmarks(density, [prior, prior, 1e-6])
+    detected = places + np.array([-aside, aside])
+    after, matches = tracker.update(state, spread_out(detected, deviation))
+    S, gain = prior**2 + deviation**2, prior**2 / (prior**2 + deviation**2)
+    anything = density + 2.0 * 2.0 / (np.pi * (detected**2).sum(axis=1).max())
+    right = np.exp(-0.5 * aside @ aside / S) / (2.0 * np.pi * S)
+    [(shown, _)] = matches.pairs
+    p, moved = right / (2.0 * right + anything), gain * aside * (1.0 - 2.0 * shown)
+    assert 0.3 < p < 0.4
+    np.testing.assert_allclose(after.pose[:2], state.pose[:2] + p * moved, atol=2e-3)
+    spread = p * (1.0 - p) * np.outer(moved, moved)
+    expected = (prior**2 - p * gain * prior**2) * np.eye(2) + spread
+    np.testing.assert_allclose(after.pose_covariance[:2, :2], expected, rtol=0.01, atol=1e-4)
+
+
+def test_first_matches_that_others_contradict_are_not_fused():
+    """Two against two show nothing; two against three, the three are believed."""
+    places, aside = np.array([[15.0, 8.0], [12.0, -9.0], [-10.0, 9.0], [-14.0, -8.0], [3.0, 14.0]]), [0.3, 0.2]
+    tracker = Tracker(spread_out(places, 0.02), stray_density=0.01, bias_deviation=1e-6, least_deviation=0.0)
+    before, _ = tracker.start(np.zeros(3), np.diag([0.4, 0.4, 1e-4]) ** 2)
+    detected = places - np.outer([1.0, 1.0, -1.0, -1.0, 1.0], aside)
+    same, undecided = tracker.update(before, spread_out(detected[:4], 0.05))
+    np.testing.assert_array_equal(same.mean, before.mean)
+    assert not undecided.is_fused
+    moved, decided = tracker.update(before, spread_out(detected, 0.05))
+    assert decided.pairs[:, 1].tolist() == [0, 1, 4]
+    np.testing.assert_allclose(moved.pose[:2], aside, atol=0.02)
+
+
 def test_strays_do_not_make_an_uncertain_pose_too_sure():
     """One detection of twenty shows something else, up to a metre beside: 0.016 of them in a square metre."""
     deviations, rng, squares = np.array([0.4, 0.4, 0.05]), np.random.default_rng(0), {0.0: [], 0.016: []}

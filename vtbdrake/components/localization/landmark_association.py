@@ -1,15 +1,26 @@
 """Association of the detections of a scan with the landmarks of a map, around a pose that is known roughly.
 
 Pairs of detection and landmark within a gate on the Mahalanobis distance, d² = νᵀ S⁻¹ ν with the innovation ν and its
-covariance S, are hypotheses. The anchor is the one that agrees with most others, after the state has been conditioned
+covariance S, are candidates. The anchor is the one that agrees with most others, after the state has been conditioned
 on it, or, if it is alone, best with the state. It decides which pairs are possible; the best one-to-one assignment
 among them is taken. Diameters count in the assignment.
 
 A match may be wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs
-that exclude it, and of what the map does not show. The first match of a landmark, which is not in the state yet, needs
-at least 0.8, and d² within a narrower gate, because another landmark may be near on the map. What the map does not show
-lies anywhere, or, with ``stray_density``, beside a landmark: branches, lower parts of a trunk, a second tree. Then the
-anchor may be wrong, too: it and the pairs that exclude it have their densities given the pair that agrees best with it.
+that exclude it, and of what the map does not show, which lies anywhere. The first match of a landmark, which is not in
+the state yet, needs at least 0.8, and d² within a narrower gate, because another landmark may be near on the map.
+
+With ``stray_density``, what the map does not show also lies beside a landmark: branches, lower parts of a trunk, a
+second tree. Then the pair that agrees with most others may be wrong, and others with it. So there is no anchor, and all
+joint associations are weighed. Each takes a detection for one of the landmarks in whose gates it lies, no landmark
+twice, or for something else. With the innovations ν_A of its pairs, their joint covariance S_A, the likelihood ratios
+q of their diameters and the density c of what the map does not show, the association A has the weight
+
+    w_A = N(ν_A; 0, S_A) Π q c^s,    s detections show something else.
+
+The probability p of a pair is the sum of the weights of all that contain it, over the sum of all (Fortmann, Bar-Shalom
+and Scheffe, "Sonar tracking of multiple targets using joint probabilistic data association", IEEE Journal of Oceanic
+Engineering 8, 1983). So pairs that share neither detection nor landmark, but contradict each other, lower the
+probability of each other, too. The assignment with the largest sum of probabilities is taken.
 """
 
 from __future__ import annotations
@@ -28,6 +39,11 @@ from vtbdrake.components.localization.planar import transform
 
 # Hypotheses that are tried in the association of a scan.
 _HYPOTHESES = 40
+
+# The largest number of joint associations that are weighed.
+_JOINT = 100
+# Those with less than this share of the largest weight, by the detections so far, are left out.
+_NEGLIGIBLE = 1e-6
 
 # The weight of the d² of a hypothesis itself, beside the d² of each pair that agrees with it.
 _DECIDES = 1e-6
@@ -52,23 +68,30 @@ class MatchedPairs(NamedTuple):
         pairs: Indices of the detection and of the landmark on the map, (k, 2).
         squares: Their d², (k,).
         probability: The probabilities that they are right, (k,).
-        rivals: The densities of what else the detections may show, other landmarks or something beside them, over the
-            likelihood ratios of their diameters, in 1/m², (k,).
+        is_right: Which of them are right by each of h hypotheses, (h, k).
+        weights: The probabilities of these hypotheses, (h,).
     """
 
     pairs: Indices
     squares: Array
     probability: Array
-    rivals: Array
+    is_right: NDArray[np.bool_]
+    weights: Array
 
     @classmethod
     def none(cls) -> MatchedPairs:
         """Return no matches."""
-        return cls(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0), np.zeros(0))
+        return cls.all_right(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0))
+
+    @classmethod
+    def all_right(cls, pairs: Indices, squares: Array, probability: Array) -> MatchedPairs:
+        """Return matches with a single hypothesis, by which all of them are right."""
+        return cls(pairs, squares, probability, np.ones((1, len(pairs)), dtype=bool), np.ones(1))
 
     def select(self, mask: NDArray[np.bool_] | Indices) -> MatchedPairs:
         """Return the matches for which a mask (k,) is true, or those with these indices, in their order."""
-        return MatchedPairs(self.pairs[mask], self.squares[mask], self.probability[mask], self.rivals[mask])
+        chosen = self.pairs[mask], self.squares[mask], self.probability[mask]
+        return MatchedPairs(*chosen, self.is_right[:, mask], self.weights)
 
     def first(self, count: int) -> MatchedPairs:
         """Return the first ``count`` matches."""
@@ -178,26 +201,19 @@ class Association:
         i, j = np.nonzero(squares < threshold)
         if not len(i):
             return MatchedPairs.none()
-        nu, S, doubts = innovations[i, j], covariances[i, j], self.stray_density > 0.0
-        compared = _compared(i, j, nu, S, expected.covariance, threshold, doubts=doubts)
         diameter_cost = self._diameter_cost(detections.select(i), sizes[0][j], sizes[1][j])
-        cost = compared.squares + np.log(compared.determinants) + diameter_cost
-        gain = np.zeros(squares.shape)
-        is_possible = (compared.squares < threshold) & ~compared.is_excluded
-        gain[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
-        rows, columns = one_to_one(gain)
-        density, diameter_ratio = np.zeros(squares.shape), np.ones(squares.shape)
-        density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
-        diameter_ratio[i, j] = np.exp(-0.5 * diameter_cost)
+        near = _Candidates(i, j, innovations[i, j], covariances[i, j], squares[i, j], diameter_cost)
         area = 0.5 * field_of_view * max(1.0, float((detections.positions**2).sum(axis=1).max()))
         unmapped = _UNMAPPED_ODDS * len(detections) / area + self.stray_density
-        rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - 2.0 * density + unmapped
-        probability = (density / (density + rivals))[rows, columns]
-        pairs = np.column_stack([rows, expected.indices[columns]])
-        odds = (rivals / diameter_ratio)[rows, columns]
-        matches = MatchedPairs(pairs, squares[rows, columns], probability, odds)
-        is_sure = (probability >= _LEAST_PROBABILITY) & (matches.squares < chi_square_quantile(self.first_gate, 2))
-        return matches.select(is_sure | ~expected.is_first[columns])
+        if self.stray_density > 0.0:
+            matches = _weighed(near, expected.covariance, unmapped)
+        else:
+            matches = _anchored(near, expected.covariance, unmapped, threshold)
+        is_sure = matches.probability >= _LEAST_PROBABILITY
+        is_sure &= matches.squares < chi_square_quantile(self.first_gate, 2)
+        rows, columns = matches.pairs.T
+        named = matches._replace(pairs=np.column_stack([rows, expected.indices[columns]]))
+        return named.select(is_sure | ~expected.is_first[columns])
 
     def _diameter_cost(self, detections: Landmarks, diameters: Array, deviations: Array) -> Array:
         """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map.
@@ -217,38 +233,62 @@ class Association:
         return np.minimum(cost, _DIAMETER_CAP)
 
 
-class _Comparison(NamedTuple):
-    """Pairs within the gate, compared after conditioning on the anchor.
-
-    If the anchor may be wrong, it and the pairs that exclude it are conditioned on the pair that agrees best with it;
-    without one, they keep their own d² and covariances. Otherwise the anchor has a d² of 0, and these pairs an infinite
-    one.
+class _Candidates(NamedTuple):
+    """Pairs within the gate.
 
     Attributes:
-        squares: The d² of the pairs, (k,).
-        determinants: The determinants of their covariances in m^4, (k,).
-        is_excluded: Whether the pair shares its detection or its landmark with the anchor, (k,).
+        detections: Their detections, (k,).
+        landmarks: Their landmarks, as places among those that are expected, (k,).
+        nu: Their innovations in m, (k, 2).
+        S: The covariances of those in m², (k, 2, 2).
+        squares: Their d², (k,).
+        diameter_cost: -2 times the log-likelihood ratios of their diameters, (k,).
     """
 
+    detections: Indices
+    landmarks: Indices
+    nu: Array
+    S: Array
     squares: Array
-    determinants: Array
-    is_excluded: NDArray[np.bool_]
+    diameter_cost: Array
 
 
-def _compared(
-    i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float, *, doubts: bool
-) -> _Comparison:
-    """Return k pairs, compared.
+def _anchored(near: _Candidates, joint: Array, unmapped: float, threshold: float) -> MatchedPairs:
+    """Return the best assignment of candidates that agree with the anchor; its pairs name landmarks as they do.
 
     Args:
-        i: The detections of the pairs, (k,).
-        j: The landmarks of the pairs, (k,), as rows of ``joint``.
-        nu: Their innovations, (k, 2).
-        S: The covariances of those, (k, 2, 2).
-        joint: The covariances of all expected detections with each other, (m, m, 2, 2).
+        near: The candidates.
+        joint: The covariances of all expected detections with each other in m², (m, m, 2, 2).
+        unmapped: The density of what the map does not show in 1/m².
         threshold: The largest d² of pairs that agree.
-        doubts: Whether the anchor may be wrong.
     """
+    i, j = near.detections, near.landmarks
+    agreeing, determinants = _agreeing(near, joint, threshold)
+    cost = agreeing + np.log(determinants) + near.diameter_cost
+    shape = int(i.max()) + 1, len(joint)
+    squares, gain, density = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    squares[i, j] = near.squares
+    is_possible = agreeing < threshold
+    gain[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
+    rows, columns = one_to_one(gain)
+    density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
+    rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - 2.0 * density + unmapped
+    probability = (density / (density + rivals))[rows, columns]
+    return MatchedPairs.all_right(np.column_stack([rows, columns]), squares[rows, columns], probability)
+
+
+def _agreeing(near: _Candidates, joint: Array, threshold: float) -> tuple[Array, Array]:
+    """Return the d² of k candidates after conditioning on the anchor, (k,), 0 of itself, infinite where it excludes.
+
+    Also returned are the determinants, (k,) in m^4, of the conditional covariances; what it excludes, and itself, keep
+    their own.
+
+    Args:
+        near: The candidates.
+        joint: The covariances of all expected detections with each other in m², (m, m, 2, 2).
+        threshold: The largest d² of pairs that agree.
+    """
+    i, j, nu, S = near.detections, near.landmarks, near.nu, near.S
     tried = np.unique(np.linspace(0, len(i) - 1, _HYPOTHESES).astype(int))
     C = joint[j[:, None], j[tried]]
     K = C @ np.linalg.inv(S[tried])
@@ -257,20 +297,74 @@ def _compared(
     is_itself = np.arange(len(i))[:, None] == tried
     excludes = ((i[:, None] == i[tried]) | (j[:, None] == j[tried])) & ~is_itself
     squares = np.where(is_itself, 0.0, np.where(excludes, np.inf, squared_distances(rest, spread)))
-    unconditional = squared_distances(nu, S)
     agreement = np.zeros((i.max() + 1, len(tried)))
     np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
     # A detection that is alone has nothing that agrees with it: then what fits the state best is the anchor.
-    anchor = np.argmax(agreement.sum(axis=0) - _DECIDES * unconditional[tried])
-    is_excluded = excludes[:, anchor]
-    is_apart = is_itself[:, anchor] | is_excluded
-    conditional, covariances = squares[:, anchor].copy(), spread[:, anchor].copy()
-    if not doubts:
-        covariances[is_apart] = S[is_apart]
-        return _Comparison(conditional, np.maximum(np.linalg.det(covariances), 1e-12), is_excluded)
-    agreeing = np.where(is_apart, np.inf, conditional)[tried]
-    partner = np.argmin(agreeing)
-    has_partner = agreeing[partner] < threshold
-    conditional[is_apart] = squares[is_apart, partner] if has_partner else unconditional[is_apart]
-    covariances[is_apart] = spread[is_apart, partner] if has_partner else S[is_apart]
-    return _Comparison(conditional, np.maximum(np.linalg.det(covariances), 1e-12), is_excluded)
+    anchor = np.argmax(agreement.sum(axis=0) - _DECIDES * near.squares[tried])
+    is_apart = (is_itself | excludes)[:, anchor]
+    covariances = np.where(is_apart[:, None, None], S, spread[:, anchor])
+    return squares[:, anchor], np.maximum(np.linalg.det(covariances), 1e-12)
+
+
+class _JointAssociations(NamedTuple):
+    """Joint associations of the first detections of a scan, h of them, and what they leave to the others.
+
+    Attributes:
+        is_right: Which of k candidates they contain, (h, k).
+        log_weights: The logarithms of their weights, (h,).
+        nu: The innovations of the candidates in m, conditioned on the pairs of each association, (h, k, 2).
+        S: The covariances of those with each other in m², (h, k, k, 2, 2).
+    """
+
+    is_right: NDArray[np.bool_]
+    log_weights: Array
+    nu: Array
+    S: Array
+
+    def select(self, mask: NDArray[np.bool_] | Indices) -> _JointAssociations:
+        """Return those for which a mask (h,) is true, or those with these indices, in their order."""
+        return _JointAssociations(*(values[mask] for values in self))
+
+    def with_pair(self, p: int, diameter_cost: float) -> _JointAssociations:
+        """Return them with one more of the candidates, of which the diameters have that cost."""
+        nu, S = self.nu[:, p], self.S[:, p, p]
+        cost = squared_distances(nu, S) + np.log(np.maximum(np.linalg.det(S), 1e-12)) + diameter_cost
+        C = self.S[:, :, p]
+        K = C @ np.linalg.inv(S)[:, None]
+        is_right = self.is_right.copy()
+        is_right[:, p] = True
+        return _JointAssociations(
+            is_right,
+            self.log_weights - 0.5 * cost - np.log(2.0 * np.pi),
+            self.nu - np.einsum("hkij,hj->hki", K, nu),
+            self.S - np.einsum("hkij,hqlj->hkqil", K, C),
+        )
+
+
+def _weighed(near: _Candidates, joint: Array, unmapped: float) -> MatchedPairs:
+    """Return the most probable assignment, with all joint associations; its pairs name landmarks as candidates do.
+
+    Args:
+        near: The candidates.
+        joint: The covariances of all expected detections with each other in m², (m, m, 2, 2).
+        unmapped: The density of what the map does not show in 1/m².
+    """
+    k, j = np.arange(len(near.landmarks)), near.landmarks
+    S = joint[j[:, None], j]
+    S[k, k] = near.S
+    found = _JointAssociations(np.zeros((1, len(k)), dtype=bool), np.zeros(1), near.nu[None], S[None])
+    for detection in np.unique(near.detections):
+        choices = [found._replace(log_weights=found.log_weights + np.log(unmapped))]
+        for p in np.flatnonzero(near.detections == detection):
+            is_free = ~found.is_right[:, j == j[p]].any(axis=1)
+            choices.append(found.select(is_free).with_pair(p, near.diameter_cost[p]))
+        found = _JointAssociations(*(np.concatenate(values) for values in zip(*choices, strict=True)))
+        order = np.argsort(-found.log_weights, kind="stable")[:_JOINT]
+        found = found.select(order[found.log_weights[order] > found.log_weights[order[0]] + np.log(_NEGLIGIBLE)])
+    weights = np.exp(found.log_weights - found.log_weights[0])
+    weights /= weights.sum()
+    pairs, probability = np.column_stack([near.detections, j]), weights @ found.is_right
+    gain, place = np.zeros((2, int(near.detections.max()) + 1, len(joint)))
+    gain[tuple(pairs.T)], place[tuple(pairs.T)] = probability, k
+    chosen = place[one_to_one(gain)].astype(np.intp)
+    return MatchedPairs(pairs, near.squares, probability, found.is_right, weights).select(chosen)

@@ -44,11 +44,11 @@ and in the test of the innovation. Who stands still learns nothing from further 
 
 A detection may show something beside the landmark that it is matched with. Where few landmarks are seen, nothing
 contradicts it, and most of all where the pose was uncertain, it moves the pose by much. With ``stray_density``, the
-hypotheses are that all k pairs of a scan are right, or that one of them is wrong and says nothing. Pair i has the odds
-c_i / N(r_i; 0, R_i), where c_i is the density of what else the detection may show, and r_i its innovation given the
-other pairs, with the covariance R_i. The estimate is the mean of these hypotheses' estimates, and its covariance
-contains how far they lie apart, as in the probabilistic data association filter (Bar-Shalom and Tse, "Tracking in a
-cluttered environment with probabilistic data association", Automatica 11, 1975; here with one wrong pair at most).
+association weighs all joint associations of the scan, also those that contradict the pairs that are fused. By each of
+them, some of these pairs are right, and the others are wrong and say nothing. The estimate is the mean of these
+hypotheses' estimates, and its covariance contains how far they lie apart, as in the filter with joint probabilistic
+data association (Fortmann, Bar-Shalom and Scheffe, "Sonar tracking of multiple targets using joint probabilistic data
+association", IEEE Journal of Oceanic Engineering 8, 1983).
 
 A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees.
 
@@ -484,9 +484,9 @@ class Tracker:
 
     def _fused(self, state: TrackState, view: SensorView, matches: MatchedPairs) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
-        detections, pairs, rivals = view.landmarks, matches.pairs, matches.rivals
+        detections, is_weighed = view.landmarks, len(matches.weights) > 1
         # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
-        while len(pairs):
+        while len(pairs := matches.pairs):
             rows = places_of(state.indices, pairs[:, 1])
             expected, H = self._expected(state, rows, is_scan=view.is_scan)
             nu = (detections.positions[pairs[:, 0]] - expected).ravel()
@@ -498,21 +498,20 @@ class Tracker:
             parts = (nu * weighted).reshape(-1, 2).sum(axis=1)
             if parts.sum() <= chi_square_quantile(self.gate, 2 * len(pairs)):
                 break
-            worst = np.argmax(parts)
-            pairs, rivals = np.delete(pairs, worst, axis=0), np.delete(rivals, worst)
+            worst = np.argmin(matches.probability) if is_weighed else np.argmax(parts)
+            matches = matches.select(np.arange(len(pairs)) != worst)
         else:
             return state, _NO_MATCHES
         nis, repeated = float(parts.sum()), self._repeated(state, rows)
-        odds = _stray_odds(S, nu, rivals) if self.stray_density else None
         if repeated.any():
             S += block_diag(*(repeated[:, None, None] * detections.covariances[pairs[:, 0]]))
             factor = cho_factor(S, lower=True)
             weighted = cho_solve(factor, nu)
-        if odds is None:
-            P = state.covariance - PHt @ cho_solve(factor, PHt.T)
-        else:
-            weighted, information = _mixed(S, nu, odds)
+        if is_weighed:
+            weighted, information = _mixed(S, nu, matches.is_right, matches.weights)
             P = state.covariance - PHt @ information @ PHt.T
+        else:
+            P = state.covariance - PHt @ cho_solve(factor, PHt.T)
         mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
         seen_at = state.seen_at.copy()
         seen_at[rows] = state.travelled
@@ -657,51 +656,27 @@ def _variance_within(gate: float) -> float:
     return 1.0 + 0.5 * (1.0 - 1.0 / gate) * chi_square_quantile(gate, 2)
 
 
-def _stray_odds(S: Array, nu: Array, rivals: Array) -> Array:
-    """Return the odds that one pair is wrong and all others are right, against all right, (k,).
-
-    Args:
-        S: The covariance of the innovations in m², (2 k, 2 k).
-        nu: The innovations in m, (2 k,).
-        rivals: The densities of what else each detection may show, in 1/m², (k,).
-    """
-    W = np.asarray(np.linalg.inv(S), dtype=float)
-    # The innovation of a pair less what the others say of it is W_ii⁻¹ (W ν)_i, with the covariance W_ii⁻¹.
-    information, weighted = _blocks(W), (W @ nu).reshape(-1, 2)
-    squares = np.einsum("ni,nij,nj->n", weighted, np.linalg.inv(information), weighted)
-    odds: Array = rivals * 2.0 * np.pi * np.exp(0.5 * squares) / np.sqrt(np.linalg.det(information))
-    return odds
-
-
-def _mixed(S: Array, nu: Array, odds: Array) -> tuple[Array, Array]:
+def _mixed(S: Array, nu: Array, is_right: NDArray[np.bool_], weights: Array) -> tuple[Array, Array]:
     """Return a and B, with which the state moves by P Hᵀ a and its covariance falls by P Hᵀ B H P.
 
-    They are the mean and the covariance of a mixture: all pairs are right, or one of them is wrong.
+    They are the mean and the covariance of a mixture: by each hypothesis, some of k pairs are right.
 
     Args:
         S: The covariance of the innovations in m², (2 k, 2 k).
         nu: The innovations in m, (2 k,).
-        odds: The odds of each pair to be wrong, (k,).
+        is_right: Which pairs are right by each hypothesis, (h, k).
+        weights: The probabilities of the hypotheses, (h,).
     """
-    W = np.asarray(np.linalg.inv(S), dtype=float)
-    k = len(odds)
-    columns = W.reshape(2 * k, k, 2).transpose(1, 0, 2)
-    gains = columns @ np.linalg.inv(_blocks(W))
-    # Without pair i: W less W_:i W_ii⁻¹ W_i:.
-    without = W - gains @ columns.transpose(0, 2, 1)
-    hypotheses = np.concatenate([W[None], without])
-    weights = np.concatenate([[1.0], odds]) / (1.0 + odds.sum())
-    steps = hypotheses @ nu
-    a = weights @ steps
-    B = np.einsum("h,hij->ij", weights, hypotheses) - (weights[:, None] * steps).T @ steps + np.outer(a, a)
+    subsets, places = np.unique(is_right, axis=0, return_inverse=True)
+    probability = np.bincount(places.ravel(), weights=weights)
+    # The inverse of the part of S of the pairs that are right; the others say nothing.
+    is_used = np.repeat(subsets, 2, axis=1)
+    both = is_used[:, :, None] & is_used[:, None, :]
+    information = np.where(both, np.linalg.inv(np.where(both, S, np.eye(len(S)))), 0.0)
+    steps = information @ nu
+    a = probability @ steps
+    B = np.einsum("h,hij->ij", probability, information) - (probability[:, None] * steps).T @ steps + np.outer(a, a)
     return a, B
-
-
-def _blocks(W: Array) -> Array:
-    """Return the blocks on the diagonal of a matrix (2 k, 2 k), (k, 2, 2)."""
-    k = np.arange(len(W) // 2)
-    blocks: Array = W.reshape(len(k), 2, len(k), 2)[k, :, k]
-    return blocks
 
 
 def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
