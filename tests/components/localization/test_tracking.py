@@ -389,6 +389,27 @@ def test_scan_with_one_landmark_that_is_new_is_not_fused():
     np.testing.assert_array_equal(after.mean, before.mean)
 
 
+@pytest.mark.parametrize(
+    ("stray_density", "aside", "ends"),
+    [
+        pytest.param(0.0, [[0.0, 0.0]], True, id="one match"),
+        pytest.param(0.0, [[0.8, 0.0]], False, id="one far from where it should be"),
+        pytest.param(8.0, [[0.0, 0.0], [0.0, 0.0]], False, id="two that may be something else"),
+    ],
+)
+def test_doubt_ends_with_probable_matches(stray_density, aside, ends):
+    """The doubt begins with a scan that shows nothing of the map."""
+    places = np.array([[8.0, 4.0], [8.0, -4.0], [-8.0, 4.0], [-8.0, -4.0], [2.0, 9.0], [2.0, -9.0]])
+    tracker = Tracker(spread_out(places, 0.02), stray_density=stray_density, bias_deviation=1e-6)
+    surely = np.diag([0.01, 0.01, 1e-3]) ** 2
+    state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], spread_out(places, 0.05))
+    doubtful, _ = tracker.update(state, spread_out(places + np.array([0.0, 30.0]), 0.05))
+    assert not tracker.is_doubtful(state) and tracker.is_doubtful(doubtful)
+    vague = tracker.predict(doubtful, np.zeros(3), np.diag([0.3, 0.3, 1e-3]) ** 2 / doubtful.drift, extent=0.0)
+    after, matches = tracker.update(vague, spread_out(places[: len(aside)] + np.array(aside), 0.05))
+    assert matches.is_fused == ends and tracker.is_doubtful(after) == (not ends)
+
+
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
 def test_single_detection_is_matched_with_the_nearer_of_two_neighbours(order):
     """Whatever their order on the map."""

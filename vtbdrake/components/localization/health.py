@@ -4,7 +4,8 @@
 the last fused scan showed. If the map is revised, it may lack most of what is detected: then a scan whose detections
 do not match fails only if it shows too few of the map's landmarks in plain view, too. Scans with few detections are
 judged together, as soon as they have enough. The track is lost after ``patience`` failures in succession, or when
-position or heading are too uncertain.
+position or heading are too uncertain. Until then, a scan that matches ends the doubt. As the pose may be far off, a
+match then has to be as probable as a first match, also of a landmark in the state.
 
 *Evidence.* The d² of a right first match is chi-square distributed, the d² of a match by chance is uniform within the
 gate γ of first matches. So the log-likelihood ratio of a match with d² is (a share ε = 0.2 of matches is by chance

@@ -85,13 +85,19 @@ class MatchedPairs(NamedTuple):
 
     @classmethod
     def all_right(cls, pairs: Indices, squares: Array, probability: Array) -> MatchedPairs:
-        """Return matches with a single hypothesis, by which all of them are right."""
+        """Return matches with a single hypothesis, by which all of them are right.
+
+        Args:
+            pairs: Indices of the detection and of the landmark on the map, (k, 2).
+            squares: Their d², (k,).
+            probability: The probabilities that they are right, (k,).
+        """
         return cls(pairs, squares, probability, np.ones((1, len(pairs)), dtype=bool), np.ones(1))
 
     def select(self, mask: NDArray[np.bool_] | Indices) -> MatchedPairs:
         """Return the matches for which a mask (k,) is true, or those with these indices, in their order."""
-        chosen = self.pairs[mask], self.squares[mask], self.probability[mask]
-        return MatchedPairs(*chosen, self.is_right[:, mask], self.weights)
+        pairs, squares, probability = self.pairs[mask], self.squares[mask], self.probability[mask]
+        return MatchedPairs(pairs, squares, probability, self.is_right[:, mask], self.weights)
 
     def first(self, count: int) -> MatchedPairs:
         """Return the first ``count`` matches."""
@@ -104,7 +110,7 @@ class ExpectedDetections:
 
     Attributes:
         indices: The indices of the landmarks on the map, (m,).
-        is_first: Whether each of them would be matched for the first time, (m,).
+        is_first: Whether each of them would be matched for the first time, or counts so, as in doubt, (m,).
         positions: The expected detections in the level frame H in m, (m, 2).
         covariance: The covariances of all of them with each other in m², (m, m, 2, 2), without the noise of detections.
     """
@@ -326,7 +332,12 @@ class _JointAssociations(NamedTuple):
         return _JointAssociations(*(values[mask] for values in self))
 
     def with_pair(self, p: int, diameter_cost: float) -> _JointAssociations:
-        """Return them with one more of the candidates, of which the diameters have that cost."""
+        """Return the associations with one more pair.
+
+        Args:
+            p: The place of the pair among the candidates.
+            diameter_cost: -2 times the log-likelihood ratio of its diameters.
+        """
         nu, S = self.nu[:, p], self.S[:, p, p]
         cost = squared_distances(nu, S) + np.log(np.maximum(np.linalg.det(S), 1e-12)) + diameter_cost
         C = self.S[:, :, p]
@@ -352,19 +363,20 @@ def _weighed(near: _Candidates, joint: Array, unmapped: float) -> MatchedPairs:
     k, j = np.arange(len(near.landmarks)), near.landmarks
     S = joint[j[:, None], j]
     S[k, k] = near.S
-    found = _JointAssociations(np.zeros((1, len(k)), dtype=bool), np.zeros(1), near.nu[None], S[None])
+    hypotheses = _JointAssociations(np.zeros((1, len(k)), dtype=bool), np.zeros(1), near.nu[None], S[None])
     for detection in np.unique(near.detections):
-        choices = [found._replace(log_weights=found.log_weights + np.log(unmapped))]
+        choices = [hypotheses._replace(log_weights=hypotheses.log_weights + np.log(unmapped))]
         for p in np.flatnonzero(near.detections == detection):
-            is_free = ~found.is_right[:, j == j[p]].any(axis=1)
-            choices.append(found.select(is_free).with_pair(p, near.diameter_cost[p]))
-        found = _JointAssociations(*(np.concatenate(values) for values in zip(*choices, strict=True)))
-        order = np.argsort(-found.log_weights, kind="stable")[:_JOINT]
-        found = found.select(order[found.log_weights[order] > found.log_weights[order[0]] + np.log(_NEGLIGIBLE)])
-    weights = np.exp(found.log_weights - found.log_weights[0])
+            is_free = ~hypotheses.is_right[:, j == j[p]].any(axis=1)
+            choices.append(hypotheses.select(is_free).with_pair(p, near.diameter_cost[p]))
+        hypotheses = _JointAssociations(*(np.concatenate(values) for values in zip(*choices, strict=True)))
+        hypotheses = hypotheses.select(np.argsort(-hypotheses.log_weights, kind="stable")[:_JOINT])
+        least = hypotheses.log_weights[0] + np.log(_NEGLIGIBLE)
+        hypotheses = hypotheses.select(hypotheses.log_weights > least)
+    weights = np.exp(hypotheses.log_weights - hypotheses.log_weights[0])
     weights /= weights.sum()
-    pairs, probability = np.column_stack([near.detections, j]), weights @ found.is_right
+    pairs, probability = np.column_stack([near.detections, j]), weights @ hypotheses.is_right
     gain, place = np.zeros((2, int(near.detections.max()) + 1, len(joint)))
     gain[tuple(pairs.T)], place[tuple(pairs.T)] = probability, k
-    chosen = place[one_to_one(gain)].astype(np.intp)
-    return MatchedPairs(pairs, near.squares, probability, found.is_right, weights).select(chosen)
+    assigned = place[one_to_one(gain)].astype(np.intp)
+    return MatchedPairs(pairs, near.squares, probability, hypotheses.is_right, weights).select(assigned)

@@ -50,7 +50,8 @@ hypotheses' estimates, and its covariance contains how far they lie apart, as in
 data association (Fortmann, Bar-Shalom and Scheffe, "Sonar tracking of multiple targets using joint probabilistic data
 association", IEEE Journal of Oceanic Engineering 8, 1983).
 
-A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees.
+A scan with a single match is fused if the landmark is in the state; a first match needs another one that agrees. After
+a scan that failed, all matches have to be as probable as first matches.
 
 If the map is revised (``revises``), a detection that can show no landmark of the map and none of the state begins a
 landmark that the map lacks. With the pose, the bias and the noise of the detection it has the position
@@ -339,7 +340,7 @@ class Tracker:
             return failed, Matches(matches.pairs)
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
         # A first match alone has nothing that agrees with it; one of a landmark in the state does not need it.
-        if len(matches.pairs) < 2 and (is_first.all() or not len(matches.pairs)):
+        if len(matches.pairs) < 2 and is_first.all():
             return self._revised(state.with_arrays(unjudged=unjudged), view, matches.pairs), Matches(matches.pairs)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
@@ -352,7 +353,8 @@ class Tracker:
         evidence = min(self.credit, state.evidence + health.evidence(first.squares, self.first_gate))
         drift = health.drift_after(state, fused) if remaining.is_fused else state.drift
         fused = fused.with_arrays(unjudged=unjudged)
-        fused = replace(fused, evidence=evidence, failures=0, drift=drift)
+        failures = 0 if remaining.is_fused else state.failures
+        fused = replace(fused, evidence=evidence, failures=failures, drift=drift)
         return self._revised(fused, view, remaining.pairs) if remaining.is_fused else fused, remaining
 
     def is_lost(self, state: TrackState) -> bool:
@@ -466,6 +468,8 @@ class Tracker:
         if not len(near):
             return MatchedPairs.none()
         expected = self._expected_of(state, near, view)
+        # In doubt, landmarks of the state are believed no more than those that are seen for the first time.
+        expected = replace(expected, is_first=expected.is_first | (state.failures > 0))
         return self._association.matched(
             detections,
             expected,
