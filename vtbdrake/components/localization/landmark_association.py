@@ -327,9 +327,9 @@ class _JointAssociations(NamedTuple):
     nu: Array
     S: Array
 
-    def select(self, mask: NDArray[np.bool_] | Indices) -> _JointAssociations:
-        """Return those for which a mask (h,) is true, or those with these indices, in their order."""
-        return _JointAssociations(*(values[mask] for values in self))
+    def select(self, rows: Indices) -> _JointAssociations:
+        """Return the associations with these indices, in their order."""
+        return _JointAssociations(self.is_right[rows], self.log_weights[rows], self.nu[rows], self.S[rows])
 
     def with_pair(self, p: int, diameter_cost: float) -> _JointAssociations:
         """Return the associations with one more pair.
@@ -366,13 +366,13 @@ def _weighed(near: _Candidates, joint: Array, unmapped: float) -> MatchedPairs:
     hypotheses = _JointAssociations(np.zeros((1, len(k)), dtype=bool), np.zeros(1), near.nu[None], S[None])
     for detection in np.unique(near.detections):
         choices = [hypotheses._replace(log_weights=hypotheses.log_weights + np.log(unmapped))]
-        for p in np.flatnonzero(near.detections == detection):
-            is_free = ~hypotheses.is_right[:, j == j[p]].any(axis=1)
+        for p in np.flatnonzero(near.detections == detection).tolist():
+            is_free = np.flatnonzero(~hypotheses.is_right[:, j == j[p]].any(axis=1))
             choices.append(hypotheses.select(is_free).with_pair(p, near.diameter_cost[p]))
         hypotheses = _JointAssociations(*(np.concatenate(values) for values in zip(*choices, strict=True)))
         hypotheses = hypotheses.select(np.argsort(-hypotheses.log_weights, kind="stable")[:_JOINT])
         least = hypotheses.log_weights[0] + np.log(_NEGLIGIBLE)
-        hypotheses = hypotheses.select(hypotheses.log_weights > least)
+        hypotheses = hypotheses.select(np.flatnonzero(hypotheses.log_weights > least))
     weights = np.exp(hypotheses.log_weights - hypotheses.log_weights[0])
     weights /= weights.sum()
     pairs, probability = np.column_stack([near.detections, j]), weights @ hypotheses.is_right
