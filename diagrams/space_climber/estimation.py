@@ -25,9 +25,6 @@ MEASUREMENTS = NamedVector(
 )
 """What the estimator reads."""
 
-# The rates of roll and yaw are singular at a pitch of +-90 deg.
-_LEAST_COSINE = 0.05
-
 
 def make_perceived_environment(*, period: float, morphology: Morphology) -> System:
     r"""Return the estimator: attitude by a complementary filter, position by leg odometry.
@@ -44,8 +41,9 @@ def make_perceived_environment(*, period: float, morphology: Morphology) -> Syst
     ``measurements`` is [imu (6), joint_encoders (18), foot_contact (6)], ``pose`` is [roll, pitch, yaw, x, y, height],
     the state of the last sample.
 
-    Attitude: R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. The angles integrate the gyro's w; roll and
-    pitch are drawn to the direction of the specific force f with the time constant tau:
+    Attitude: R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. Each sample turns it by the gyro's mean w
+    over the period T, R_WB exp([w T]x): exact, however fast the body turns. Then roll and pitch are drawn to the
+    direction of the specific force f with the time constant tau:
 
         roll_f = atan2(f_y, f_z),   pitch_f = atan2(-f_x, |(f_y, f_z)|)
 
@@ -110,20 +108,12 @@ def complementary_filter(attitude: Expression, imu: Expression, *, period: float
         period: The sample period in s.
         trust: The weight of the specific force, in [0, 1].
     """
-    roll, pitch, yaw = (attitude[k] for k in range(3))
-    wx, wy, wz, fx, fy, fz = (imu[k] for k in range(6))
-    sr, cr, cp = casadi.sin(roll), casadi.cos(roll), casadi.cos(pitch)
-    cp = casadi.if_else(casadi.fabs(cp) > _LEAST_COSINE, cp, casadi.copysign(_LEAST_COSINE, cp))
-    yaw_rate = (sr * wy + cr * wz) / cp
-    roll = roll + period * (wx + casadi.sin(pitch) * yaw_rate)
-    pitch = pitch + period * (cr * wy - sr * wz)
-    yaw = yaw + period * yaw_rate
+    R = rotation(attitude) @ turn(period * imu[:3])
+    roll, pitch = casadi.atan2(R[2, 1], R[2, 2]), casadi.atan2(-R[2, 0], casadi.norm_2(R[2, 1:]))
+    fx, fy, fz = (imu[k] for k in range(3, 6))
     roll = roll + trust * wrap(casadi.atan2(fy, fz) - roll)
     pitch = pitch + trust * (casadi.atan2(-fx, casadi.sqrt(fy * fy + fz * fz)) - pitch)
-    # Over the top: the same orientation with its pitch in [-90, 90] deg.
-    over = pi * (casadi.fabs(pitch) > pi / 2)
-    pitch = casadi.if_else(over > 0.0, casadi.asin(casadi.sin(pitch)), pitch)
-    return casadi.vertcat(wrap(roll + over), pitch, wrap(yaw + over))
+    return casadi.vertcat(wrap(roll), pitch, casadi.atan2(R[1, 0], R[0, 0]))
 
 
 def rotation(attitude: Expression) -> Expression:
@@ -135,6 +125,19 @@ def rotation(attitude: Expression) -> Expression:
         casadi.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         casadi.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
         casadi.horzcat(-sp, cp * sr, cp * cr),
+    )
+
+
+def turn(vector: Expression) -> Expression:
+    """Return the rotation matrix exp([v]x), (3, 3), of a turn about the axis v by |v|, v in rad, (3, 1)."""
+    angle = casadi.norm_2(vector)
+    # sin(angle / 2) / angle, by its limit where there is no turn.
+    share = casadi.if_else(angle > 0.0, casadi.sin(0.5 * angle) / casadi.fmax(angle, 1e-300), 0.5)
+    w, (x, y, z) = casadi.cos(0.5 * angle), (share * vector[k] for k in range(3))
+    return casadi.vertcat(
+        casadi.horzcat(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        casadi.horzcat(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        casadi.horzcat(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 
