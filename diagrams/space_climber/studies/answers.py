@@ -27,6 +27,7 @@ from vtbdrake_diagrams.space_climber.studies.payload import (
     static_limit,
     statics,
 )
+from vtbdrake_diagrams.space_climber.studies.rover import FEW_ROCKS, GROUNDS, Ground
 
 # How far simulated and static limit of the locked robot may be apart, in kg: the step at which masses were tried.
 LOCKED_STEP = 1.0
@@ -36,8 +37,8 @@ SECOND_ENGINE = (MOON, EARTH, SLOPE)
 MUJOCO_MASSES = (20.0, 60.0)
 # How far the boundaries of one environment in MuJoCo may be apart, in kg: a wider interval would agree with anything.
 LARGEST_SPREAD = 6.0
-# In how many craters the robot is judged, the share in which it must reach the rim, and by how much more than the best
-# baseline.
+# In how many craters of each kind the robot is judged, the share in which it must reach the rim, and by how much more
+# than the best baseline.
 LEAST_CRATERS = 100
 LEAST_REACHED = 0.9
 LEAST_GAIN = 0.2
@@ -174,16 +175,19 @@ def _range(boundary: Boundary) -> str:
 
 
 @dataclass(frozen=True)
-class HeadingAnswer:
-    """The walks of all strategies in the craters that are judged, and whether those that were repeated end the same.
+class GroundAnswer:
+    """The walks of all strategies in the craters of a kind that are judged.
 
     Attributes:
         crossings: The passable craters in which all strategies have walked, see `perceived.judged`.
-        repeated: Name of a walk that was repeated -> whether it ended as in the file.
     """
 
     crossings: tuple[perceived.Crossing, ...]
-    repeated: Mapping[str, bool]
+
+    @property
+    def count(self) -> int:
+        """Return the number of craters."""
+        return len(self.crossings)
 
     def reached(self, strategy: str) -> int:
         """Return in how many craters a strategy reaches the rim; a robot that stands still has not."""
@@ -201,14 +205,40 @@ class HeadingAnswer:
         return sum(bool(walk.stops) and walk.stops[-1].heading is None for walk in walks)
 
     @property
-    def holds(self) -> bool:
-        """Return whether decisions reach the rim often enough, and more often than the best baseline, in 100 craters.
+    def gain(self) -> float:
+        """Return by how much larger the share that reaches the rim is than with the best baseline."""
+        return (self.reached(perceived.COMPARED[0]) - self.reached(self.baseline)) / max(self.count, 1)
 
-        A refusal is a miss. Walks that were repeated must end as before.
+
+@dataclass(frozen=True)
+class HeadingAnswer:
+    """The walks on all grounds, and whether those that were repeated end the same.
+
+    Attributes:
+        grounds: The walks by the name of the ground.
+        repeated: Name of a walk that was repeated -> whether it ended as in the file.
+    """
+
+    grounds: Mapping[str, GroundAnswer]
+    repeated: Mapping[str, bool]
+
+    @property
+    def together(self) -> GroundAnswer:
+        """Return the walks on all grounds, as of one."""
+        return GroundAnswer(tuple(crossing for each in self.grounds.values() for crossing in each.crossings))
+
+    @property
+    def holds(self) -> bool:
+        """Return whether decisions reach the rim often enough, and by far more often than the best baseline.
+
+        Both are judged by all craters together, of which there must be enough of each kind. On no ground a baseline may
+        be better. A refusal is a miss. Walks that were repeated must end as before.
         """
-        count, reached = len(self.crossings), self.reached(perceived.COMPARED[0])
-        better = reached - self.reached(self.baseline) >= LEAST_GAIN * count
-        return count >= LEAST_CRATERS and reached >= LEAST_REACHED * count and better and all(self.repeated.values())
+        together, grounds = self.together, self.grounds.values()
+        often = together.reached(perceived.COMPARED[0]) >= LEAST_REACHED * together.count
+        enough = len(grounds) == len(GROUNDS) and all(each.count >= LEAST_CRATERS for each in grounds)
+        better = together.gain >= LEAST_GAIN and all(each.gain >= 0.0 for each in grounds)
+        return enough and often and better and all(self.repeated.values())
 
 
 def heading(full: bool) -> Answer:
@@ -218,29 +248,38 @@ def heading(full: bool) -> Answer:
     adds some. The short version repeats one of them, a baseline's; the long one a tenth, the robot's own among them.
     """
     walks = perceived.load()
-    cases = perceived.judged(walks)
-    result = HeadingAnswer(cases, _repeated(cases, full=full))
-    reached = {strategy: result.reached(strategy) for strategy in perceived.COMPARED}
-    missed = [case for case in cases if not case.walks[perceived.COMPARED[0]].reached]
-    reasons = [f"crater {case.seed}: {case.walks[perceived.COMPARED[0]].reason}" for case in missed]
-    older = perceived.older()
-    impassable = sum(crossing.passable is False for crossing in perceived.crossings(walks))
+    cases = {ground: perceived.judged(walks, ground) for ground in GROUNDS}
+    grounds = {ground.name: GroundAnswer(crossings) for ground, crossings in cases.items()}
+    result = HeadingAnswer(grounds, _repeated(cases, full=full))
+    reasoned = perceived.COMPARED[0]
+    reached = "; ".join(f"{name}: {each.reached(reasoned)} of {each.count}" for name, each in grounds.items())
+    baselines = [
+        f"{name}: {', '.join(f'{strategy} {each.reached(strategy)}' for strategy in perceived.COMPARED[1:])}"
+        for name, each in grounds.items()
+    ]
+    impassable = sum(each.passable is False for ground in GROUNDS for each in perceived.crossings(walks, ground))
+    missed = [
+        f"crater {case.seed}: {case.walks[reasoned].reason}"
+        for crossings in cases.values()
+        for case in crossings
+        if not case.walks[reasoned].reached
+    ]
     return Answer(
         id="R1",
         question="Which heading takes the robot from the bottom of a crater to its rim?",
-        answer=f"decided at each stop; the rim reached in {reached[perceived.COMPARED[0]]} of {len(cases)} craters",
+        answer=f"decided at each stop; the rim reached with {reached} craters",
         unit="",
         interval=None,
         paper=crater.PAPER,
-        cases=f"craters below {perceived.FIRST_SEED}",
-        held_out=f"{len(cases)} craters in which some fixed heading passes; {LEAST_CRATERS} are asked for",
-        baseline=", ".join(f"{strategy} {reached[strategy]}" for strategy in perceived.COMPARED[1:]),
-        refused=result.refused,
+        cases=f"craters below {FEW_ROCKS.first_seed}",
+        held_out=f"craters in which some fixed heading passes; {LEAST_CRATERS} of each kind are asked for",
+        baseline="; ".join(baselines),
+        refused=sum(each.refused for each in grounds.values()),
         holds=result.holds,
         note=(
-            f"No fixed heading passes in {impassable} more. Missed: {'; '.join(reasons) or 'none'}. Repeated: "
+            f"No fixed heading passes in {impassable} more. Missed: {'; '.join(missed) or 'none'}. Repeated: "
             f"{', '.join(f'{name}, {_same(same)}' for name, same in result.repeated.items()) or 'none'}. "
-            f"{older} of the {len(walks)} walks are by an older version of the program."
+            f"{perceived.older()} of the {len(walks)} walks are by an older version of the program."
         ),
     )
 
@@ -249,14 +288,17 @@ def _same(same: bool) -> str:
     return "as in the file" if same else "ANOTHER END"
 
 
-def _repeated(cases: Sequence[perceived.Crossing], *, full: bool) -> dict[str, bool]:
+def _repeated(cases: Mapping[Ground, Sequence[perceived.Crossing]], *, full: bool) -> dict[str, bool]:
     """Return whether walks that are drawn at random end as in the file: one in the short version, else a tenth."""
     rng = np.random.default_rng()
-    count = ceil(0.1 * len(cases)) if full else min(1, len(cases))
+    walked = [(ground, crossing) for ground, crossings in cases.items() for crossing in crossings]
+    count = ceil(0.1 * len(walked)) if full else min(1, len(walked))
     strategies = perceived.COMPARED if full else ("straight",)
     repeated = {}
-    for case in rng.choice(np.arange(len(cases)), count, replace=False):
-        seed, site = cases[case].seed, perceived.Site(cases[case].seed)
+    for number in rng.choice(np.arange(len(walked)), count, replace=False):
+        ground, crossing = walked[number]
+        site = perceived.Site(crossing.seed, ground)
         for strategy in strategies:
-            repeated[f"{strategy} in crater {seed}"] = site.run(strategy).reached == cases[case].walks[strategy].reached
+            same = site.run(strategy).reached == crossing.walks[strategy].reached
+            repeated[f"{strategy} in crater {crossing.seed}"] = same
     return repeated

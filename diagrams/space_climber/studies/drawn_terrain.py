@@ -13,7 +13,8 @@ from collections.abc import Sequence
 import click
 import numpy as np
 
-from vtbdrake_diagrams.space_climber.studies.perceived import FIRST_SEED, Site, Walk, judged, load
+from vtbdrake_diagrams.space_climber.studies.perceived import Site, Walk, judged, load
+from vtbdrake_diagrams.space_climber.studies.rover import FEW_ROCKS
 
 
 def comparison(without: Sequence[Walk], drawn: Sequence[Walk]) -> str:
@@ -44,7 +45,7 @@ def comparison(without: Sequence[Walk], drawn: Sequence[Walk]) -> str:
 
 
 @click.command()
-@click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first crater.")
+@click.option("--first", default=FEW_ROCKS.first_seed, show_default=True, help="Seed of the first crater.")
 @click.option("--count", default=1, show_default=True, help="Number of craters; only passable ones count.")
 @click.option("--draws", default=2, show_default=True, help="Number of draws of the ground.")
 def main(first: int, count: int, draws: int) -> None:

@@ -43,21 +43,16 @@ from vtbdrake_diagrams.space_climber.crater_scenario import ENDS, PASSED, Crater
 from vtbdrake_diagrams.space_climber.dps import add_walker
 from vtbdrake_diagrams.space_climber.ground_map import GroundMap
 from vtbdrake_diagrams.space_climber.studies.crater import MASS, POSE, differing
+from vtbdrake_diagrams.space_climber.studies.explorer import Explorer, mental_reasoner
 from vtbdrake_diagrams.space_climber.studies.perceived import (
     BLOCKED_AHEAD,
     BLOCKED_WAY,
     BLOCKED_WITHIN,
     GOING_BACK,
     LEG,
-    LONGEST,
     LOOKING,
-    ROCK_COVER,
-    SEGMENT,
-    Explorer,
-    Rover,
-    mental_reasoner,
-    true_world,
 )
+from vtbdrake_diagrams.space_climber.studies.rover import FEW_ROCKS, SEGMENT, Rover, true_world
 from vtbdrake_diagrams.space_climber.survey import survey
 
 PERIOD = 0.2
@@ -287,7 +282,7 @@ class ExploringScenario(CraterScenario):
     # Discrete steps, as in the worlds of `perceived`.
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     plant_config: MultibodyPlantConfig = field(default_factory=_plant_config)
-    rock_cover: float = ROCK_COVER
+    rock_cover: float = FEW_ROCKS.rock_cover
     scans: bool = True
 
     @classmethod
@@ -392,7 +387,7 @@ class Exploration:
         return self.end == PASSED
 
 
-def explore(seed: int, *, seconds: float = LONGEST, echo: Callable[[str], Any] = print) -> Exploration:
+def explore(seed: int, *, seconds: float = FEW_ROCKS.longest, echo: Callable[[str], Any] = print) -> Exploration:
     """Let the robot find its way out of a crater of `perceived`, in Drake.
 
     Args:
@@ -426,7 +421,7 @@ def _decision(testbed: VirtualTestbed, context: Context) -> str:
 @click.command()
 @click.option("--seed", default=1000, show_default=True, help="Seed of the first crater.")
 @click.option("--count", default=1, show_default=True, help="Number of craters.")
-@click.option("--seconds", default=LONGEST, show_default=True, help="How long the robot may take, in s.")
+@click.option("--seconds", default=FEW_ROCKS.longest, show_default=True, help="How long the robot may take, in s.")
 @click.option("--quiet", is_flag=True, help="Do not print the decisions.")
 def main(seed: int, count: int, seconds: float, quiet: bool) -> None:
     """Let the robot find its way out of craters in Drake, and print what its DPS decides."""

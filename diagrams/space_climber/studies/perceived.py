@@ -2,13 +2,10 @@
 
 Before it starts, the robot has a survey from orbit, which is coarse and partly wrong (`survey`). At each stop it looks
 around with its laser scanner, adds what it sees to its semantic world model, builds a mental world of that, tries
-headings there from its belief, and walks `LEG` seconds in the best one. Slip that it felt on the way is friction of the
-patches it walked on. Where it is blocked, it goes back as it came, remembers the place as an obstacle, looks and
-decides again; if no heading gains much, it tries to walk backwards, too. It never sees the crater's seed, and of the
-true terrain nothing but scans and its own motion.
-
-What a heading is worth is the believed cost to the rim (`route`) at the end of its rollout: less is better. The rollout
-tells what the robot's feet do among the rocks and on the slope next to it, the route what lies beyond.
+headings there from its belief (`explorer`), and walks `LEG` seconds in the best one. Slip that it felt on the way is
+friction of the patches it walked on. Where it is blocked, it goes back as it came, remembers the place as an obstacle,
+looks and decides again; if no heading gains much, it tries to walk backwards, too. It never sees the crater's seed, and
+of the true terrain (`rover`) nothing but scans and its own motion.
 
 ``python -m vtbdrake_diagrams.space_climber.studies.perceived`` runs craters, and adds them to a file of results.
 """
@@ -17,8 +14,7 @@ from __future__ import annotations
 
 import ast
 import json
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import date
 from functools import cache, cached_property
@@ -29,77 +25,32 @@ from typing import Any
 import click
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.plant import MultibodyPlantConfig
-from pydrake.systems.analysis import SimulatorConfig
 
-import vtbdrake as vtb
-from vtbdrake.common.arrays import Array
-from vtbdrake.common.scan import Scan
-from vtbdrake.compiled import CompiledRollouts, FixedPiece, Terrain
-from vtbdrake.components.world_model import WorldModel
-from vtbdrake.reasoning import Budget, Reasoner, SearchConfig
-from vtbdrake.rollout import Executor
-from vtbdrake.rollout.compiled_executor import CompiledExecutor
-from vtbdrake.testbed import VirtualTestbed
-from vtbdrake_diagrams.space_climber.believed_scenario import BelievedCraterScenario, believed_world, level_world
-from vtbdrake_diagrams.space_climber.believed_terrain import FRICTION, BelievedTerrain, NoReturnError
-from vtbdrake_diagrams.space_climber.crater_scenario import ENDS, PASSED, X_BL, CraterScenario
-from vtbdrake_diagrams.space_climber.ground_map import OffTheMapError
-from vtbdrake_diagrams.space_climber.morphology import Morphology
-from vtbdrake_diagrams.space_climber.route import CLEARANCE, Route, route
+from vtbdrake.compiled import Terrain
+from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
+from vtbdrake_diagrams.space_climber.crater_scenario import PASSED, CraterScenario
+from vtbdrake_diagrams.space_climber.route import CLEARANCE, route
 from vtbdrake_diagrams.space_climber.standing_scanner import StandingScanner
-from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, MASS, POSE, WALK, differing
+from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, POSE, WALK, differing
+from vtbdrake_diagrams.space_climber.studies.explorer import Explorer, Stop
+from vtbdrake_diagrams.space_climber.studies.rover import (
+    FEW_ROCKS,
+    GROUNDS,
+    SEGMENT,
+    CompiledRover,
+    Ground,
+    Rover,
+    terrain_of,
+    true_world,
+)
 from vtbdrake_diagrams.space_climber.survey import survey
-from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, crater_shapes
-
-PLACE = ("sim.sys.climber.base.x", "sim.sys.climber.base.y")
-"""Where the robot is, in m."""
-
-ROCK_COVER = 0.03
-"""The share of the ground that rocks cover, as at the least rocky landing sites; see `terrain`."""
-
-FIRST_SEED = 1300
-"""Craters from this seed on are judged; those below were looked at."""
+from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS
 
 LEG = 20.0
 """How long the robot walks until it looks again, in s: 3.8 m on level ground."""
 
 LOOKING = 5.0
 """How long it stands and looks, in s: until it stands, and one scan from then on."""
-
-SEGMENT = 5.0
-"""How long the simulated reality goes on in one call, in s."""
-
-TRIED = 28.0
-"""Horizon of a rollout in s: longer than a leg, so that it does not end in front of a rock."""
-
-WIDEST_TRIED = np.radians(80.0)
-"""How far beside the x axis headings are tried, in rad."""
-
-CANDIDATES = 9
-"""How many headings are tried beside the one along the route, 20 deg apart."""
-
-SPEED = 0.19
-"""What the robot walks on level ground, in m/s."""
-
-ENOUGH = 0.75
-"""The share of the best that is possible from which on no other headings are tried."""
-
-LEAST_GAIN = 0.2
-"""A rollout that brings the robot less far down the cost to the rim, in m, brings it nowhere."""
-
-LONGEST = 600.0
-"""The longest time that a robot may take, its stops included, in s. Without a detour it takes a little more than 300 s,
-so there is time for one. With 450 s, as it was for craters below 1300, walks were cut that still gained; see
-docs/crater.md."""
-
-RADIUS = SPEED * TRIED + 3.0
-"""How far a mental world reaches, in m."""
-
-TRIED_BACKWARDS = 1.0
-"""If no heading gains as much, in m, walking backwards is tried, too."""
 
 BLOCKED_WITHIN = 10.0
 """A robot that came less far than `BLOCKED_WAY` within this time, in s, is blocked."""
@@ -125,28 +76,9 @@ STRATEGIES = ("reasoned", "surveyed route", "least slope", "straight", "perceive
 COMPARED = STRATEGIES[:4]
 """The decision, and the baselines that it is compared with. The route over what is seen shows what trying adds."""
 
+GROUND_BY_NAME = {ground.name: ground for ground in GROUNDS}
+
 RESULTS = Path(__file__).with_name("perceived.jsonl")
-
-
-@dataclass(frozen=True)
-class Stop:
-    """What the robot knew and did at one stop.
-
-    Attributes:
-        time: Simulated time in s.
-        place: Believed place (x, y, z) in m.
-        heading: Heading it went on with, in rad; None if it stood still.
-        walk: 1 if it walked on in that heading, -1 if it walked backwards.
-        tried: Headings in rad that were tried, each with its walk, and by how much it lowers the cost to the rim, in m.
-        said: Why the decision is poor, or why it stands still; empty if it is neither.
-    """
-
-    time: float
-    place: tuple[float, float, float]
-    heading: float | None
-    walk: float = 1.0
-    tried: tuple[tuple[float, float, float], ...] = ()
-    said: str = ""
 
 
 @dataclass(frozen=True)
@@ -162,6 +94,7 @@ class Walk:
         reason: How the simulation ended.
         stops: The stops.
         thinking: Processor time in s of building and trying, over all stops.
+        ground: The name of the crater's kind, one of `GROUNDS`.
     """
 
     seed: int
@@ -172,352 +105,7 @@ class Walk:
     reason: str
     stops: tuple[Stop, ...] = field(default=(), repr=False)
     thinking: float = 0.0
-
-
-@dataclass
-class CostToRim:
-    """The quality of a rollout, which is to be small: the believed cost to the rim in m, see `route`.
-
-    Attributes:
-        route: The route over the terrain as it is believed to be now; each stop has another one.
-    """
-
-    route: Route
-
-    def __call__(self, x: float, y: float) -> float:
-        return self.route.cost_at([float(x), float(y)])
-
-
-def true_world(seed: int) -> CraterScenario:
-    """Return the simulated reality of a crater: friction and mass differ from what is usual, and its ground is wavy."""
-    return replace(
-        differing(seed, seed).scenario,
-        rock_cover=ROCK_COVER,
-        scans=True,
-        simulator_config=SimulatorConfig(),
-        plant_config=MultibodyPlantConfig(
-            time_step=0.02,
-            contact_model="point",
-            discrete_contact_approximation="sap",
-            # What contact switches see is then compiled, too.
-            use_sampled_output_ports=False,
-        ),
-    )
-
-
-class Rover:
-    """The robot in the simulated reality, with what it has in its own sensors and estimates.
-
-    Attributes:
-        testbed: The simulated reality.
-        context: Its state.
-        ended: The message with which the simulation ended; empty while it goes on.
-    """
-
-    def __init__(self, testbed: VirtualTestbed, *, mass: float) -> None:
-        self.testbed = testbed
-        self.context = testbed.default_context()
-        testbed.write(self.context, {WALK: 0.0, MASS: mass * testbed.read(self.context, MASS)})
-        self._simulator = testbed.simulator(self.context)
-        self.ended: str = ""
-
-    @property
-    def time(self) -> float:
-        """Return the simulated time in s."""
-        return float(self.context.get_time())
-
-    @property
-    def place(self) -> Array:
-        """Return where the robot believes to be, (x, y) in m."""
-        place: Array = np.array(self.testbed.read(self.context, "dps.impl.navigator.position"))
-        return place
-
-    @property
-    def yaw(self) -> float:
-        """Return the believed azimuth of the robot's x axis in rad."""
-        return float(self.testbed.read(self.context, "dps.env.yaw"))
-
-    @property
-    def stepped(self) -> Array:
-        """Return where its legs have stepped to, (x, y) in m: leg odometry."""
-        stepped: Array = np.array(self.testbed.read(self.context, "dps.env.position"))[:2]
-        return stepped
-
-    def X_WL(self, terrain: BelievedTerrain) -> RigidTransform:
-        """Return the believed pose of the scanner: the elevation is the believed ground's plus the legs' height."""
-        rpy = [float(self.testbed.read(self.context, f"dps.env.{name}")) for name in ("roll", "pitch", "yaw")]
-        height = float(self.testbed.read(self.context, "dps.env.position")[2])
-        place = self.place
-        z = float(terrain.ground.height([place])[0]) + height
-        return RigidTransform(RollPitchYaw(rpy), [*place, z]) @ X_BL
-
-    def scan(self) -> Scan:
-        """Return the last complete scan."""
-        scanner = self.testbed.diagram.GetSubsystemByName("sim.sense.scanner")
-        scan: Scan = scanner.GetOutputPort("scan").Eval(scanner.GetMyContextFromRoot(self.context))
-        return scan
-
-    def advance(self, duration: float, **commands: float) -> None:
-        """Give commands, and go on for a time in s, or to the end of the simulation."""
-        self.testbed.write(self.context, {f"u.{name}": value for name, value in commands.items()})
-        status = self._simulator.AdvanceTo(self.time + duration)
-        if status.reason() == status.ReturnReason.kReachedTerminationCondition:
-            message = status.FormatMessage()
-            self.ended = next((end for end in ENDS if end in message), message)
-
-
-class CompiledRover(Rover):
-    """The same robot in the same world, which is compiled once for all craters; the crater is data.
-
-    It scans when it is asked, as if it had stood still before.
-
-    Args:
-        world: The simulated reality.
-        terrain: Its ground and boulders.
-        scanner: What looks at them.
-        mass: Factor of the torso's mass.
-    """
-
-    def __init__(self, world: CraterScenario, terrain: Terrain, scanner: StandingScanner, *, mass: float) -> None:
-        self.testbed, self._rollouts = compiled_world()
-        self._terrain, self._scanner = terrain, scanner
-        self.context = self.testbed.default_context()
-        pose = np.array(self.testbed.read(self.context, POSE))
-        # As high over the highest place under its feet as in the testbed that was compiled.
-        pose[2] += _lowest_start(world) - _lowest_start(self.testbed.scenario)
-        self.testbed.write(self.context, {WALK: 0.0, MASS: mass * self.testbed.read(self.context, MASS), POSE: pose})
-        self.ended: str = ""
-
-    def scan(self) -> Scan:
-        pose = np.array(self.testbed.read(self.context, POSE))
-        return self._scanner.scan(RigidTransform(RollPitchYaw(pose[3:]), pose[:3]), self.time)
-
-    def advance(self, duration: float, **commands: float) -> None:
-        self.testbed.write(self.context, {f"u.{name}": value for name, value in commands.items()})
-        (z,), (end,), (self.ended,) = self.simulate(self.states([{}]), self.time, duration)
-        self.set_state(z, end)
-
-    def set_state(self, z: Array, time: float) -> None:
-        """Set the state to a vector of state and parameters, and the time (s)."""
-        self._rollouts.walker.write(z, self.context)
-        self.context.SetTime(time)
-
-    def states(self, values: Sequence[Mapping[str, float]]) -> Array:
-        """Return the vectors of state and parameters with values by address, a row for each mapping."""
-        rows = []
-        for each in values:
-            self.testbed.write(self.context, each)
-            rows.append(self._rollouts.walker.read(self.context))
-        return np.array(rows)
-
-    def simulate(self, z: Array, begin: float, duration: float) -> tuple[Array, list[float], list[str]]:
-        """Return the states at the end of walks, when they ended (s), and the messages of those that ended early.
-
-        Args:
-            z: The states at the begin, shape (n, nz).
-            begin: The time at the begin in s.
-            duration: How long they go on at most, in s.
-        """
-        self._rollouts.stand_on(self._terrain)
-        z, now, finish = z.copy(), begin, begin + duration
-        under_way, ends, messages = np.arange(len(z)), np.full(len(z), finish), [""] * len(z)
-        while len(under_way) and now < finish - 0.5 * SEGMENT:
-            batch = self._rollouts.from_z(z[under_way], now)
-            z[under_way] = batch.final
-            for row, k in enumerate(under_way.tolist()):
-                if not batch.valid[row]:
-                    messages[k], ends[k] = f"{NOT_COMPILED}: {batch.reasons[row]}", now
-                elif batch.messages[row]:
-                    messages[k] = next(end for end in ENDS if end in batch.messages[row])
-                    ends[k] = now + batch.ends[row]
-            now = self._rollouts.schedule_at(now)[-1].time
-            under_way = np.array([k for k in under_way if not messages[k]], dtype=int)
-        ends[under_way] = now
-        return z, ends.tolist(), messages
-
-
-NOT_COMPILED = "the compiled world does not hold"
-"""A walk that ends so is none: the world has to be simulated in Drake."""
-
-
-@cache
-def compiled_world() -> tuple[VirtualTestbed, CompiledRollouts]:
-    """Return a testbed of the simulated reality, and its compiled rollouts, which stand on any crater."""
-    testbed = replace(true_world(0), scans=False, boulders=False, rock_cover=0.0).build()
-    rollouts = testbed.compiled(horizon=SEGMENT, sample_period=SEGMENT, parameters=[HEADING, WALK, MASS], check=False)
-    return testbed, rollouts
-
-
-def terrain_of(world: CraterScenario) -> Terrain:
-    """Return ground and boulders of a world for `compiled_world`, with its friction of feet and ground."""
-    testbed, rollouts = compiled_world()
-    feet = testbed.scenario.friction
-    ground = combined_friction(world.friction, feet)
-    return rollouts.terrain([FixedPiece(shape, X_WS, ground) for _, shape, X_WS in crater_shapes(world.crater)])
-
-
-def combined_friction(friction: float, feet: float) -> float:
-    """Return the friction b of ground that makes a given one with feet of the friction a: Drake has 2 a b / (a + b)."""
-    return friction * feet / (2.0 * feet - friction)
-
-
-def _lowest_start(world: CraterScenario) -> float:
-    return float(world.crater.mesh_height(Morphology().stance[:, :2]).max())
-
-
-@cache
-def mental_reasoner() -> tuple[Reasoner, CompiledExecutor, CostToRim, BelievedCraterScenario]:
-    """Return the reasoner of all stops, its executor and its quality, whose world and route each stop sets."""
-    scenario = believed_world(true_world(0), level_world(), friction=FRICTION[0] - FRICTION[1])
-    quality, executor = CostToRim(Route((0.0, 0.0), np.zeros((2, 2)))), CompiledExecutor(compile=True, workers=1)
-    return heading_reasoner(scenario, quality, executor=executor), executor, quality, scenario
-
-
-@dataclass
-class Explorer:
-    """The robot's head: what it believes, and how it decides at a stop.
-
-    Attributes:
-        scenario: The robot's own scenario; of its crater nothing is used.
-        terrain: What it believes of the terrain.
-        tries: Whether it tries headings in mental worlds; False follows the route.
-        draws: In how many draws of the terrain each heading is tried, beside the believed one.
-        thinking: Processor time of building and trying so far, in s.
-    """
-
-    scenario: CraterScenario
-    terrain: BelievedTerrain
-    tries: bool = True
-    draws: int = 0
-    thinking: float = 0.0
-
-    def look(self, rover: Rover) -> str:
-        """Add what the robot sees to what it believes; return why it could not, or nothing."""
-        try:
-            self.terrain = self.terrain.after_scan(rover.scan(), rover.X_WL(self.terrain))
-        except (NoReturnError, OffTheMapError) as error:
-            return str(error)
-        return ""
-
-    def decide(self, rover: Rover) -> Stop:
-        """Return the next heading, or why the robot stands still."""
-        place = rover.place
-        said = self.look(rover)
-        here = (float(place[0]), float(place[1]), float(rover.X_WL(self.terrain).translation()[2]) if not said else 0.0)
-        if said:
-            return Stop(rover.time, here, None, said=said)
-        way = route(self.terrain)
-        ahead = way.heading(place)
-        if not self.tries:
-            return Stop(rover.time, here, ahead)
-        begin = time.process_time()
-        gains = self._try(rover, way, ahead)
-        self.thinking += time.process_time() - begin
-        (heading, walk), gain = max(gains.items(), key=lambda pair: pair[1])
-        tried = tuple((angle, direction, value) for (angle, direction), value in gains.items())
-        if gain < LEAST_GAIN:
-            said = f"poor: of {len(gains)} headings none lowers the cost to the rim by {LEAST_GAIN:g} m"
-        return Stop(rover.time, here, heading, walk, tried, said)
-
-    def _try(self, rover: Rover, way: Route, ahead: float) -> dict[tuple[float, float], float]:
-        """Return for the headings (rad) and walks that were tried by how much they lower the cost to the rim, in m."""
-        start, grounds = way.cost_at(rover.place), self._grounds(rover.place)
-        along = self._gains(rover, way, grounds, (ahead, 1.0), Budget(rollouts=1))
-        # As far as the route goes down on the level, over the horizon and without a rock.
-        end = way.path(rover.place, length=SPEED * TRIED)[-1]
-        if min(along.values(), default=-np.inf) >= ENOUGH * (start - way.cost_at(end)):
-            return along
-        gains = self._gains(rover, way, grounds, (ahead, 1.0), None)
-        if max(gains.values()) < TRIED_BACKWARDS:
-            gains |= self._gains(rover, way, grounds, (rover.yaw, -1.0), None)
-        return gains
-
-    def _grounds(self, place: Array) -> list[list[FixedPiece]]:
-        """Return the pieces of the believed world around a place (x, y) in m, and of draws of it."""
-        ground, pieces = self.terrain.ground, mental_reasoner()[3].pieces
-        draws = [ground.draw(np.random.default_rng(number)) for number in range(1, self.draws + 1)]
-        return [pieces(self._world(place, heights=heights)) for heights in (None, *draws)]
-
-    def _gains(
-        self,
-        rover: Rover,
-        way: Route,
-        grounds: Sequence[Sequence[FixedPiece]],
-        first: tuple[float, float],
-        budget: Budget | None,
-    ) -> dict[tuple[float, float], float]:
-        """Return for headings (rad) and a walk the least gain in the believed world and in draws of it, in m.
-
-        A failed rollout is a loss of all.
-
-        Args:
-            rover: The robot.
-            way: The route.
-            grounds: The pieces of the believed world, and of draws of it.
-            first: Heading and walk that are tried first; the walk is the same for all.
-            budget: How many headings are tried.
-        """
-        reasoner, executor, quality, _ = mental_reasoner()
-        (ahead, walk), quality.route, start = first, way, way.cost_at(rover.place)
-        rover.testbed.write(rover.context, {HEADING: ahead, WALK: walk})
-        gains: dict[tuple[float, float], float] = {}
-        for pieces in grounds:
-            executor.stand_on(pieces)
-            for candidate in reasoner.decide(rover.testbed, rover.context, budget=budget).candidates:
-                key = float(candidate.values.get(HEADING, ahead)), walk
-                value = float(start - candidate.quality) if np.isfinite(candidate.quality) else -start
-                gains[key] = min(gains.get(key, np.inf), value)
-        return gains
-
-    def _world(self, place: ArrayLike, *, heights: Array | None = None) -> WorldModel:
-        """Return ground and rocks around a place, over the believed ground at this place."""
-        near = np.asarray(place, dtype=float).tolist()
-        datum = float(self.terrain.ground.height([near], heights)[0])
-        return self.terrain.world_model(near=near, radius=RADIUS, heights=heights, datum=datum)
-
-    def mental(self, place: ArrayLike, *, heights: Array | None = None) -> BelievedCraterScenario:
-        """Return the mental world around a place as a scenario to simulate: what the robot believes.
-
-        Args:
-            place: The place (x, y) in m, whose believed height is 0 in that world.
-            heights: Heights at the vertices of the map, for example a draw; the believed ones by default.
-        """
-        return replace(mental_reasoner()[3], world=self._world(place, heights=heights))
-
-    def felt(self, path: Sequence[Array], stepped: float, *, blocked_by: ArrayLike | None = None) -> None:
-        """Take what the robot felt on its way: how far it came by how far it stepped, and what blocked it.
-
-        Args:
-            path: Where it was, (x, y) from the begin to the end, in m.
-            stepped: How far its legs stepped, in m.
-            blocked_by: The place (x, y) in m towards which it came no further.
-        """
-        if blocked_by is not None:
-            self.terrain = self.terrain.after_block(blocked_by)
-        way = float(np.linalg.norm(np.diff(np.array(path), axis=0), axis=1).sum())
-        if stepped > 0.5:
-            self.terrain = self.terrain.after_slip(path, way / stepped)
-
-
-def heading_reasoner(
-    scenario: BelievedCraterScenario, quality: Callable[[float, float], float], *, executor: str | Executor = "serial"
-) -> Reasoner:
-    """Return the reasoner that decides the next heading.
-
-    Args:
-        scenario: The mental world.
-        quality: What the place (x, y) at the end of a rollout costs, in m.
-        executor: Where the rollouts run.
-    """
-    return Reasoner(
-        scenario=scenario,
-        decision=[vtb.Parameter(HEADING, -WIDEST_TRIED, WIDEST_TRIED)],
-        quality=vtb.Quality(quality, of=PLACE, reading="end", minimize=True),
-        budget=Budget(rollouts=CANDIDATES + 1),
-        horizon=TRIED,
-        sample_period=4.0,
-        search=SearchConfig(method="grid", options={"points": CANDIDATES}, executor=executor),
-    )
+    ground: str = FEW_ROCKS.name
 
 
 class Site:
@@ -525,20 +113,23 @@ class Site:
 
     Attributes:
         seed: The crater's seed.
+        ground: Its kind.
         world: The simulated reality.
         terrain: What is known before the robot looks.
     """
 
-    def __init__(self, seed: int, *, in_drake: bool = False) -> None:
+    def __init__(self, seed: int, ground: Ground = FEW_ROCKS, *, in_drake: bool = False) -> None:
         """Survey a crater.
 
         Args:
             seed: The crater's seed.
+            ground: Its kind.
             in_drake: Whether Drake simulates the world, its scanner included, instead of `compiled_world`.
         """
         self.seed: int = seed
+        self.ground: Ground = ground
         self._in_drake = in_drake
-        self.world: CraterScenario = true_world(seed)
+        self.world: CraterScenario = true_world(seed, ground)
         prior = survey(self.world.crater, seed=0)
         self.terrain: BelievedTerrain = BelievedTerrain(prior.ground, prior.rocks)
 
@@ -581,25 +172,24 @@ class Site:
         explorer = Explorer(self.world, self.terrain, tries=strategy == "reasoned", draws=draws)
         way = route(self.terrain)
         stops: list[Stop] = []
-        while not _is_over(rover):
+        while not self._is_over(rover):
             if strategy not in LOOKING_STRATEGIES:
                 x, y = rover.place.tolist()
                 stops.append(Stop(rover.time, (x, y, 0.0), way.heading([x, y])))
-                rover.advance(min(LEG, LONGEST - rover.time), heading=way.heading([x, y]), walk=1.0)
+                rover.advance(min(LEG, self.ground.longest - rover.time), heading=way.heading([x, y]), walk=1.0)
                 continue
             rover.advance(LOOKING, walk=0.0)
             stops.append(explorer.decide(rover))
-            if stops[-1].heading is None or _is_over(rover):
+            if stops[-1].heading is None or self._is_over(rover):
                 break
             self._leg(rover, explorer, stops[-1].heading, stops[-1].walk)
-        return _walk(self.seed, strategy, rover, stops, explorer.thinking)
+        return self._walk(strategy, rover, stops, explorer.thinking)
 
-    @staticmethod
-    def _leg(rover: Rover, explorer: Explorer, heading: float, walk: float) -> None:
+    def _leg(self, rover: Rover, explorer: Explorer, heading: float, walk: float) -> None:
         """Walk a leg; a robot that is blocked on its way goes back a little, as it came."""
         path, begun, blocked_by = [rover.place], rover.stepped, None
         within, end = round(BLOCKED_WITHIN / SEGMENT), rover.time + LEG
-        while not _is_over(rover, end) and blocked_by is None:
+        while not self._is_over(rover, end) and blocked_by is None:
             rover.advance(SEGMENT, heading=heading, walk=walk)
             path.append(rover.place)
             if len(path) > within and np.linalg.norm(path[-1] - path[-1 - within]) < BLOCKED_WAY:
@@ -607,7 +197,7 @@ class Site:
         explorer.felt(path, float(np.linalg.norm(rover.stepped - begun)), blocked_by=blocked_by)
         if blocked_by is not None:
             yaw, end = rover.yaw, rover.time + GOING_BACK
-            while not _is_over(rover, end):
+            while not self._is_over(rover, end):
                 rover.advance(SEGMENT, heading=yaw, walk=-walk)
 
     def all_fixed(self, headings: Sequence[float]) -> list[Walk]:
@@ -618,35 +208,42 @@ class Site:
         assert isinstance(rover, CompiledRover)
         rover.advance(LOOKING, walk=0.0)
         begin = rover.states([{HEADING: heading, WALK: 1.0} for heading in headings])
-        z, ends, messages = rover.simulate(begin, rover.time, LONGEST - LOOKING)
+        z, ends, messages = rover.simulate(begin, rover.time, self.ground.longest - LOOKING)
         walks = []
         for heading, state, rover.ended, end in zip(headings, z, messages, ends, strict=True):
             rover.set_state(state, end)
-            walks.append(_walk(self.seed, heading_name(heading), rover))
+            walks.append(self._walk(heading_name(heading), rover))
         return walks
 
     def fixed(self, heading: float, strategy: str = "") -> Walk:
         """Walk in one heading (rad) until the end."""
         rover = self.rover()
         rover.advance(LOOKING, walk=0.0)
-        rover.advance(LONGEST - LOOKING, heading=heading, walk=1.0)
-        return _walk(self.seed, strategy or heading_name(heading), rover)
+        rover.advance(self.ground.longest - LOOKING, heading=heading, walk=1.0)
+        return self._walk(strategy or heading_name(heading), rover)
+
+    def _is_over(self, rover: Rover, end: float = np.inf) -> bool:
+        return bool(rover.ended) or rover.time > min(end, self.ground.longest) - 0.5 * SEGMENT
+
+    def _walk(self, strategy: str, rover: Rover, stops: Sequence[Stop] = (), thinking: float = 0.0) -> Walk:
+        end = tuple(float(value) for value in rover.testbed.read(rover.context, POSE)[:3])
+        reason = rover.ended or ("stands still: " + stops[-1].said if stops and stops[-1].heading is None else "time")
+        return Walk(
+            self.seed,
+            strategy,
+            PASSED in rover.ended,
+            rover.time,
+            end,
+            reason,
+            tuple(stops),
+            thinking,
+            self.ground.name,
+        )
 
 
 def heading_name(heading: float) -> str:
     """Return the name of the walk in one heading (rad), which is none of `STRATEGIES`."""
     return f"{np.degrees(heading):g} deg"
-
-
-def _is_over(rover: Rover, end: float = LONGEST) -> bool:
-    return bool(rover.ended) or rover.time > min(end, LONGEST) - 0.5 * SEGMENT
-
-
-def _walk(seed: int, strategy: str, rover: Rover, stops: Sequence[Stop] = (), thinking: float = 0.0) -> Walk:
-    x, y, z = (float(value) for value in rover.testbed.read(rover.context, POSE)[:3])
-    reached = PASSED in rover.ended
-    reason = rover.ended or ("stands still: " + stops[-1].said if stops and stops[-1].heading is None else "time")
-    return Walk(seed, strategy, reached, rover.time, (x, y, z), reason, tuple(stops), thinking)
 
 
 def least_slope(terrain: BelievedTerrain) -> float:
@@ -688,18 +285,21 @@ class Crossing:
         return False if walked.issuperset(map(heading_name, HEADINGS)) else None
 
 
-def crossings(walks: Sequence[Walk]) -> tuple[Crossing, ...]:
-    """Return walks by crater, in the order of the seeds."""
-    seeds = sorted({walk.seed for walk in walks})
-    return tuple(Crossing(seed, {walk.strategy: walk for walk in walks if walk.seed == seed}) for seed in seeds)
+def crossings(walks: Sequence[Walk], ground: Ground = FEW_ROCKS) -> tuple[Crossing, ...]:
+    """Return walks on one kind of ground by crater, in the order of the seeds."""
+    by_seed: dict[int, dict[str, Walk]] = {}
+    for walk in walks:
+        if walk.ground == ground.name:
+            by_seed.setdefault(walk.seed, {})[walk.strategy] = walk
+    return tuple(Crossing(seed, by_seed[seed]) for seed in sorted(by_seed))
 
 
-def judged(walks: Sequence[Walk]) -> tuple[Crossing, ...]:
-    """Return the passable craters, from `FIRST_SEED` on, in which all of `COMPARED` have walked."""
+def judged(walks: Sequence[Walk], ground: Ground = FEW_ROCKS) -> tuple[Crossing, ...]:
+    """Return the passable craters of a kind, from its first seed on, in which all of `COMPARED` have walked."""
     return tuple(
         crossing
-        for crossing in crossings(walks)
-        if crossing.seed >= FIRST_SEED and crossing.passable and crossing.walks.keys() >= set(COMPARED)
+        for crossing in crossings(walks, ground)
+        if crossing.seed >= ground.first_seed and crossing.passable and crossing.walks.keys() >= set(COMPARED)
     )
 
 
@@ -795,7 +395,7 @@ def draw(walk: Walk) -> Figure:
     Args:
         walk: A walk with stops, from a file of results.
     """
-    site = Site(walk.seed)
+    site = Site(walk.seed, GROUND_BY_NAME[walk.ground])
     crater, figure = site.world.crater, Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.add_subplot(xlabel="x in m", ylabel="y in m", aspect="equal")
     vertices = site.terrain.ground.vertices()
@@ -819,15 +419,16 @@ def draw(walk: Walk) -> Figure:
     return figure
 
 
-def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = COMPARED) -> Iterator[Walk]:
+def missing_walks(site: Site, walks: Sequence[Walk], strategies: Sequence[str] = COMPARED) -> Iterator[Walk]:
     """Yield the walks in a crater that are not among others: of strategies, and fixed ones until one passes.
 
     Args:
-        seed: The crater's seed.
+        site: The crater.
         walks: Walks that are there, in this and other craters.
         strategies: The strategies.
     """
-    site, there = Site(seed), {walk.strategy: walk for walk in walks if walk.seed == seed}
+    key = (site.seed, site.ground.name)
+    there = {walk.strategy: walk for walk in walks if (walk.seed, walk.ground) == key}
     fixed = {name: site.heading_of(name) for name in strategies if name in FIXED_STRATEGIES and name not in there}
     for name, walk in zip(fixed, site.all_fixed(list(fixed.values())), strict=True):
         there[name] = replace(walk, strategy=name)
@@ -837,7 +438,7 @@ def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = 
         yield there[name]
     # Straight on is one of the fixed headings. Some walk side by side, the most promising ones first.
     open_ = [each for each in by_slope(site.terrain) if each and heading_name(each) not in there]
-    while open_ and Crossing(seed, there).passable is None:
+    while open_ and Crossing(site.seed, there).passable is None:
         for walk in site.all_fixed(open_[:SIDE_BY_SIDE]):
             there[walk.strategy] = walk
             yield walk
@@ -845,27 +446,30 @@ def missing_walks(seed: int, walks: Sequence[Walk], strategies: Sequence[str] = 
 
 
 @click.command()
-@click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first crater.")
+@click.option("--ground", "kind", type=click.Choice([*GROUND_BY_NAME]), default=FEW_ROCKS.name, show_default=True)
+@click.option("--first", default=None, type=int, help="Seed of the first crater, by default the first that is judged.")
 @click.option("--count", default=1, show_default=True, help="Number of craters.")
 @click.option("--file", default=str(RESULTS), show_default=True, help="File of results, to which walks are added.")
 @click.option("--figure", default="", help="File of a picture of the first crater's reasoned walk, if there is one.")
 @click.option("--strategy", "strategies", multiple=True, default=COMPARED, show_default=True, help="What to compare.")
-def main(first: int, count: int, file: str, figure: str, strategies: tuple[str, ...]) -> None:
+def main(kind: str, first: int | None, count: int, file: str, figure: str, strategies: tuple[str, ...]) -> None:
     """Let the robot find its way out of craters, and compare strategies; walks of the file are not repeated."""
-    path = Path(file)
-    for seed in range(first, first + count):
-        for walk in missing_walks(seed, load(path), strategies):
+    path, ground = Path(file), GROUND_BY_NAME[kind]
+    begin = ground.first_seed if first is None else first
+    for seed in range(begin, begin + count):
+        for walk in missing_walks(Site(seed, ground), load(path), strategies):
             save(walk, path)
-        crossing = next(each for each in crossings(load(path)) if each.seed == seed)
+        crossing = next(each for each in crossings(load(path), ground) if each.seed == seed)
         for name, walk in crossing.walks.items():
             click.echo(f"crater {seed}, {name}: {_summary(walk)}")
-    pictured = [walk for walk in load(path) if walk.seed == first and walk.strategy == "reasoned"]
-    if figure and pictured:
-        draw(pictured[0]).savefig(figure, dpi=110)
-    cases = judged(load(path))
+    if figure:
+        walks = next(each.walks for each in crossings(load(path), ground) if each.seed == begin)
+        if "reasoned" in walks:
+            draw(walks["reasoned"]).savefig(figure, dpi=110)
+    cases = judged(load(path), ground)
     for strategy in COMPARED:
-        count_reached = sum(case.walks[strategy].reached for case in cases)
-        click.echo(f"{strategy}: the rim in {count_reached} of {len(cases)} passable craters")
+        reached = sum(case.walks[strategy].reached for case in cases)
+        click.echo(f"{strategy}: the rim in {reached} of {len(cases)} passable craters with {ground.name}")
 
 
 def _summary(walk: Walk) -> str:

@@ -17,15 +17,8 @@ import numpy as np
 from vtbdrake.reasoning import Decision
 from vtbdrake_diagrams.space_climber.route import route
 from vtbdrake_diagrams.space_climber.studies.crater import HEADING, WALK
-from vtbdrake_diagrams.space_climber.studies.perceived import (
-    LEG,
-    LOOKING,
-    CostToRim,
-    Explorer,
-    Site,
-    heading_reasoner,
-    mental_reasoner,
-)
+from vtbdrake_diagrams.space_climber.studies.explorer import CostToRim, Explorer, heading_reasoner, mental_reasoner
+from vtbdrake_diagrams.space_climber.studies.perceived import LEG, LOOKING, Site
 
 LEGS = 5
 """After how many legs the robot decides: it stands where the wall begins, among rocks."""

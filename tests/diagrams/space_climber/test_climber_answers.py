@@ -13,13 +13,12 @@ import pytest
 
 from vtbdrake.optimization import Boundary
 from vtbdrake_diagrams.space_climber.studies import perceived
-from vtbdrake_diagrams.space_climber.studies.answers import HeadingAnswer, PayloadAnswer
+from vtbdrake_diagrams.space_climber.studies.answers import GroundAnswer, HeadingAnswer, PayloadAnswer
+from vtbdrake_diagrams.space_climber.studies.explorer import Stop
 from vtbdrake_diagrams.space_climber.studies.perceived import (
     COMPARED,
-    FIRST_SEED,
     HEADINGS,
     Crossing,
-    Stop,
     Walk,
     code_without_docstrings,
     crossings,
@@ -31,6 +30,7 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     older,
     save,
 )
+from vtbdrake_diagrams.space_climber.studies.rover import FEW_ROCKS, MANY_ROCKS, Ground
 
 pytestmark = pytest.mark.one_python
 
@@ -93,25 +93,33 @@ def craters(reasoned: int, baseline: int, *, count: int = 100, refused: int = 0)
     for k in range(count):
         walks = {name: walk(k, name, k < baseline) for name in ("surveyed route", "least slope", "straight")}
         walks["reasoned"] = walk(k, "reasoned", k < min(reasoned, count - refused), stands=k >= count - refused)
-        crossings.append(Crossing(FIRST_SEED + k, walks))
+        crossings.append(Crossing(1300 + k, walks))
     return tuple(crossings)
 
 
-WAY = HeadingAnswer(craters(90, 70), {"straight in crater 1003": True})
+def grounds(few: tuple[Crossing, ...], many: tuple[Crossing, ...]) -> dict[str, GroundAnswer]:
+    return {"few rocks": GroundAnswer(few), "many rocks": GroundAnswer(many)}
+
+
+WAY = HeadingAnswer(grounds(craters(95, 85), craters(85, 55)), {"straight in crater 1003": True})
 
 
 def test_decisions_that_reach_the_rim_hold() -> None:
-    assert (WAY.reached("straight"), WAY.holds) == (70, True)
+    assert (WAY.grounds["many rocks"].reached("straight"), WAY.together.gain, WAY.holds) == (55, 0.2, True)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"crossings": craters(89, 60)},
-        {"crossings": craters(90, 71)},
-        {"crossings": craters(100, 60, refused=11)},
-        {"crossings": craters(99, 60, count=99)},
-        {"crossings": ()},
+        {"grounds": grounds(craters(95, 80), craters(84, 55))},  # too seldom
+        {"grounds": grounds(craters(95, 85), craters(85, 56))},  # too little better
+        {"grounds": grounds(craters(90, 91), craters(90, 40))},  # not better everywhere
+        {"grounds": grounds(craters(95, 85), craters(100, 55, refused=16))},
+        {"grounds": grounds(craters(95, 85), craters(99, 40, count=99))},
+        {"grounds": grounds(craters(99, 85, count=99), craters(90, 40))},
+        {"grounds": grounds(craters(95, 75), ())},
+        {"grounds": {"few rocks": GroundAnswer(craters(95, 75))}},
+        {"grounds": {}},
         {"repeated": {"straight in crater 1003": False}},
     ],
 )
@@ -120,7 +128,7 @@ def test_each_part_of_the_heading_can_fail(change: dict[str, object]) -> None:
 
 
 def test_refusals_are_counted() -> None:
-    assert HeadingAnswer(craters(100, 60, refused=11), {}).refused == 11
+    assert GroundAnswer(craters(100, 60, refused=11)).refused == 11
 
 
 def test_walks_are_kept_in_a_file(tmp_path: Path) -> None:
@@ -161,14 +169,17 @@ def test_the_digest_is_of_the_modules_that_python_imports() -> None:
     assert set(imported_modules(Path(perceived.__file__).resolve())) == imported
 
 
-def test_a_crater_is_judged_when_some_fixed_heading_passes_and_all_have_walked() -> None:
+@pytest.mark.parametrize("ground", [FEW_ROCKS, MANY_ROCKS])
+def test_a_crater_is_judged_when_some_fixed_heading_passes_and_all_have_walked(ground: Ground) -> None:
+    seed = ground.first_seed
     names = [heading_name(heading) for heading in HEADINGS]
-    failing = [walk(FIRST_SEED, name, False) for name in (*names, *COMPARED)]
-    (impassable,) = crossings(failing)
+    failing = [replace(walk(seed, name, False), ground=ground.name) for name in (*names, *COMPARED)]
+    (impassable,) = crossings(failing, ground)
     assert impassable.passable is False
-    (open_question,) = crossings([each for each in failing if each.strategy != "45 deg"])
+    (open_question,) = crossings([each for each in failing if each.strategy != "45 deg"], ground)
     assert open_question.passable is None
-    passing = [walk(FIRST_SEED, name, name == "45 deg") for name in (*names, *COMPARED)]
-    assert len(judged(passing)) == 1
-    assert judged(failing) == judged([each for each in passing if each.strategy != "least slope"]) == ()
-    assert judged([replace(each, seed=FIRST_SEED - 1) for each in passing]) == ()
+    passing = [replace(each, reached=each.strategy == "45 deg") for each in failing]
+    assert len(judged(passing, ground)) == 1
+    assert judged(failing, ground) == judged([w for w in passing if w.strategy != "least slope"], ground) == ()
+    assert judged([replace(each, seed=seed - 1) for each in passing], ground) == ()
+    assert judged([replace(each, ground="another") for each in passing], ground) == ()

@@ -14,6 +14,7 @@ from vtbdrake.testbed import DpsAlone, ScenarioError
 from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
 from vtbdrake_diagrams.space_climber.crater_scenario import X_BL
 from vtbdrake_diagrams.space_climber.standing_scanner import StandingScanner
+from vtbdrake_diagrams.space_climber.studies.explorer import Explorer
 from vtbdrake_diagrams.space_climber.studies.exploring import (
     LATENCY,
     PERIOD,
@@ -28,11 +29,9 @@ from vtbdrake_diagrams.space_climber.studies.perceived import (
     GOING_BACK,
     LEG,
     LOOKING,
-    SEGMENT,
-    Explorer,
     Site,
-    true_world,
 )
+from vtbdrake_diagrams.space_climber.studies.rover import SEGMENT, true_world
 from vtbdrake_diagrams.space_climber.survey import survey
 from vtbdrake_diagrams.space_climber.terrain import Crater
 

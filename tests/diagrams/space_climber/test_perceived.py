@@ -19,21 +19,19 @@ from vtbdrake_diagrams.space_climber.believed_terrain import BelievedTerrain
 from vtbdrake_diagrams.space_climber.crater_scenario import X_BL
 from vtbdrake_diagrams.space_climber.ground_map import GroundMap
 from vtbdrake_diagrams.space_climber.standing_scanner import StandingScanner
-from vtbdrake_diagrams.space_climber.studies.perceived import (
-    HEADINGS,
-    LEAST_GAIN,
-    LOOKING,
+from vtbdrake_diagrams.space_climber.studies.explorer import LEAST_GAIN, Explorer
+from vtbdrake_diagrams.space_climber.studies.perceived import HEADINGS, LOOKING, Site, least_slope
+from vtbdrake_diagrams.space_climber.studies.rover import (
+    FEW_ROCKS,
+    MANY_ROCKS,
     CompiledRover,
-    Explorer,
     Rover,
-    Site,
     combined_friction,
     compiled_world,
-    least_slope,
     true_world,
 )
 from vtbdrake_diagrams.space_climber.survey import survey
-from vtbdrake_diagrams.space_climber.terrain import Crater, crater_shapes
+from vtbdrake_diagrams.space_climber.terrain import ROCK_DISTANCE, SECTOR, Crater, crater_shapes
 
 
 def terrain(heights: np.ndarray) -> BelievedTerrain:
@@ -81,6 +79,20 @@ def test_the_least_steep_heading_is_chosen_by_the_survey() -> None:
 def test_unknown_strategies_are_named() -> None:
     with pytest.raises(ValueError, match="a strategy is one of reasoned, .*, not 'luck'"):
         Site(1).run("luck")
+
+
+def test_kinds_of_ground_differ_in_their_rocks() -> None:
+    """By area: the rocks of 0.12 m and more cover k exp(-q D), less what lies beside the field of the robot."""
+    covers = {}
+    for ground in (FEW_ROCKS, MANY_ROCKS):
+        crater = true_world(1000, ground).crater
+        assert crater.rock_cover == ground.rock_cover
+        areas = [0.25 * np.pi * block.size[0] * block.size[1] for block in crater._rocks()]
+        inner, outer = ROCK_DISTANCE
+        covers[ground] = sum(areas) / (SECTOR * (outer**2 - inner**2))
+        q = 1.79 + 0.152 / ground.rock_cover
+        assert covers[ground] == pytest.approx(ground.rock_cover * np.exp(-0.12 * q), rel=0.25)
+    assert covers[MANY_ROCKS] > 2.0 * covers[FEW_ROCKS]
 
 
 def test_worlds_differ_from_what_the_robot_uses() -> None:
