@@ -231,8 +231,8 @@ class HeadingAnswer:
     def holds(self) -> bool:
         """Return whether decisions reach the rim often enough, and by far more often than the best baseline.
 
-        Both are judged by all craters together, of which there must be enough of each kind. On no ground a baseline may
-        be better. A refusal is a miss. Walks that were repeated must end as before.
+        Both are judged by all craters together; each kind must have enough of them. On no ground a baseline may be
+        better. A refusal is a miss. Walks that were repeated must end as before.
         """
         together, grounds = self.together, self.grounds.values()
         often = together.reached(perceived.COMPARED[0]) >= LEAST_REACHED * together.count

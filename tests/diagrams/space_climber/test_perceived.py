@@ -87,7 +87,8 @@ def test_kinds_of_ground_differ_in_their_rocks() -> None:
     for ground in (FEW_ROCKS, MANY_ROCKS):
         crater = true_world(1000, ground).crater
         assert crater.rock_cover == ground.rock_cover
-        areas = [0.25 * np.pi * block.size[0] * block.size[1] for block in crater._rocks()]
+        rocks = crater.blocks[len(replace(crater, rock_cover=0.0).blocks) :]
+        areas = [0.25 * np.pi * rock.size[0] * rock.size[1] for rock in rocks]
         inner, outer = ROCK_DISTANCE
         covers[ground] = sum(areas) / (SECTOR * (outer**2 - inner**2))
         q = 1.79 + 0.152 / ground.rock_cover
