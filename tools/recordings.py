@@ -26,6 +26,9 @@ from vtbdrake_diagrams.quadruped import QuadrupedScenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.studies.captures import GRIP, bar_in_gripper
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.studies.crater import ELEVATION
+from vtbdrake_diagrams.space_climber.studies.exploring import ExploringScenario
+from vtbdrake_diagrams.space_climber.studies.rover import FEW_ROCKS, true_world
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 # Meshcat interpolates between the samples.
@@ -48,6 +51,7 @@ class Recording:
         camera: From where they are looked at first.
         spacing: The offset from one motion to the next, in m.
         sky: The colours (r, g, b) of the background at its top and at its bottom.
+        ambient: Intensity of the light that comes from everywhere; Meshcat's lamps reach some metres far.
     """
 
     title: str
@@ -56,12 +60,14 @@ class Recording:
     camera: Viewpoint
     spacing: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sky: tuple[Color, Color] = DAY
+    ambient: float = 0.6
 
     def page(self, file: Path) -> str:
         """Return the page that plays the motions kept in a file; one alone has its own colours."""
         meshcat, motions = make_meshcat(), self._read(file)
         for name, color in zip(("top_color", "bottom_color"), self.sky, strict=True):
             meshcat.SetProperty("/Background", name, list(color))
+        meshcat.SetProperty("/Lights/AmbientLight/<object>", "intensity", self.ambient)
         for helper in ("/Axes", "/Grid"):
             meshcat.SetProperty(helper, "visible", False)
         if len(motions) == 1:
@@ -106,28 +112,33 @@ def simulated(
     quality: Callable[..., float],
     of: tuple[str, ...],
     commands: Mapping[float, Mapping[str, float | tuple[float, ...]]] | None = None,
+    *,
+    period: float = PERIOD,
 ) -> Motion:
-    """Simulate a testbed; return its motion with a quality of variables.
+    """Simulate a testbed until it ends; return its motion with a quality of variables.
 
     Args:
         scenario: The scenario of the testbed.
-        end: The simulated time in s.
+        end: The simulated time in s at most.
         quality: The quality as a function of the values at the addresses.
         of: The addresses.
         commands: Time in s -> the values that are written at this time.
+        period: Time between two samples in s.
     """
     testbed = scenario.build()
     context = testbed.default_context()
     simulator = testbed.simulator(context)
     due = dict(commands or {})
-    times, states, values = np.arange(round(end / PERIOD) + 1) * PERIOD, [], []
+    times, states, values = np.arange(round(end / period) + 1) * period, [], []
     for time in times.tolist():
-        simulator.AdvanceTo(time)
+        status = simulator.AdvanceTo(time)
         for begin in [begin for begin in due if begin <= time]:
             testbed.write(context, due.pop(begin))
         states.append(np.array(testbed.read(context, STATE)))
         values.append(quality(*(testbed.read(context, address) for address in of)))
-    return Motion(scenario, times, np.array(states), np.array(values), nan)
+        if status.reason() == status.ReturnReason.kReachedTerminationCondition:
+            break
+    return Motion(scenario, times[: len(states)], np.array(states), np.array(values), nan)
 
 
 def swing_up(label: str, scenario: Scenario) -> Motion:
@@ -177,6 +188,11 @@ def pushed_trot(label: str, scenario: Scenario) -> Motion:
     return simulated(scenario, 4.0, float, ("sim.sys.quadruped.trunk.height",), commands)
 
 
+def way_out(label: str, scenario: Scenario) -> Motion:
+    """Return the motion of a climber that looks, tries headings and walks, until it has passed the rim."""
+    return simulated(scenario, FEW_ROCKS.longest, float, (ELEVATION,), period=0.25)
+
+
 CLIMBER = SpaceClimberScenario(gravity=1.62)
 RECORDINGS = {
     "cart_pole": Recording(
@@ -200,6 +216,15 @@ RECORDINGS = {
         Viewpoint((3.6, -1.9, 1.3), (0.8, 0.8, 0.1)),
         spacing=(0.0, 1.2, 0.0),
         sky=SPACE,
+    ),
+    "perceived": Recording(
+        "A robot in a crater that it does not know: at each stop it looks, builds its world, tries headings there, and "
+        "walks on. Curve: elevation [m]",
+        {"on board": ExploringScenario.in_world(true_world(1000))},
+        way_out,
+        Viewpoint((6.0, -24.0, 9.0), (15.0, -8.0, 1.0)),
+        sky=SPACE,
+        ambient=2.5,
     ),
     "quadruped": Recording(
         "A quadruped is pushed from the side at 1 s: trotting on, and deciding on its steps 50 times a second. "

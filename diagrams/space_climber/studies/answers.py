@@ -42,6 +42,8 @@ LARGEST_SPREAD = 6.0
 LEAST_CRATERS = 100
 LEAST_REACHED = 0.9
 LEAST_GAIN = 0.2
+# In how many craters walks are repeated in the short version.
+REPEATED = 3
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,8 @@ def heading(full: bool) -> Answer:
     """Answer R1: which heading takes the robot from the bottom of a crater to its rim?
 
     The robot has a survey, looks, and decides at each stop, see `perceived`. The walks are kept in a file; its program
-    adds some. The short version repeats one of them, a baseline's; the long one a tenth, the robot's own among them.
+    adds some. The short version repeats a baseline's in some craters; the long one all in a tenth, the robot's own
+    among them.
     """
     walks = perceived.load()
     cases = {ground: perceived.judged(walks, ground) for ground in GROUNDS}
@@ -289,10 +292,10 @@ def _same(same: bool) -> str:
 
 
 def _repeated(cases: Mapping[Ground, Sequence[perceived.Crossing]], *, full: bool) -> dict[str, bool]:
-    """Return whether walks that are drawn at random end as in the file: one in the short version, else a tenth."""
+    """Return whether walks in craters that are drawn at random end as in the file: in the long version in a tenth."""
     rng = np.random.default_rng()
     walked = [(ground, crossing) for ground, crossings in cases.items() for crossing in crossings]
-    count = ceil(0.1 * len(walked)) if full else min(1, len(walked))
+    count = ceil(0.1 * len(walked)) if full else min(REPEATED, len(walked))
     strategies = perceived.COMPARED if full else ("straight",)
     repeated = {}
     for number in rng.choice(np.arange(len(walked)), count, replace=False):
