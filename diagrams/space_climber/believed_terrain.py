@@ -30,7 +30,7 @@ FRICTION = (0.6, 0.06)
 
 SLIP_EXPONENT = 3.7
 """On a slope s (rise over run) with the friction mu, the robot advances by the share 1 - (s / mu)^3.7 of its steps: on
-20 deg with 0.54 that is the 0.77 of the table in docs/crater.md; on s = mu it stays where it is."""
+20 deg with 0.54 that is 0.77, and 0.76 in the table of docs/crater.md; on s = mu it stays where it is."""
 
 # Range within which points count as ground, and as rocks, in m.
 _GROUND_RANGE = 14.0
