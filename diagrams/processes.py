@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import TypeVar
 
@@ -18,6 +20,9 @@ def in_processes(
 ) -> Iterator[tuple[_Case, _Result]]:
     """Yield each case with the function's result for it, in the order of the cases.
 
+    Linear algebra has one thread in each process: several would compete for the cores, and round in another order, so
+    that a plan of a solver may be another one.
+
     Args:
         function: A function of a module, which processes find by its name.
         cases: Its arguments.
@@ -28,4 +33,21 @@ def in_processes(
         yield from ((case, function(case)) for case in cases)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from zip(cases, pool.map(function, cases), strict=True)
+        with _environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"):  # The processes start in this call.
+            results = pool.map(function, cases)
+        yield from zip(cases, results, strict=True)
+
+
+@contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    """Set variables of the environment, for processes that are started meanwhile."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +106,12 @@ def test_seed_draws_the_same_results_again() -> None:
 
 def test_processes_give_results_in_the_order_of_the_cases() -> None:
     assert list(in_processes(abs, [-3, 1, -2], workers=2)) == [(-3, 3), (1, 1), (-2, 2)]
+
+
+def test_processes_have_one_thread_for_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With several, the solver of a plan rounds in another order, and a plan may be another one."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"]
+    assert list(in_processes(os.getenv, names, workers=2)) == [(name, "1") for name in names]
+    assert [os.getenv(name) for name in names] == [None, "7"]
