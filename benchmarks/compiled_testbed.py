@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import os
 import resource
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -24,6 +22,7 @@ from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.studies.excited import ExcitedArmScenario
+from vtbdrake_diagrams.processes import environment
 
 STATE = "plant.state"
 # Rounding grows in the motion that is compared.
@@ -159,7 +158,7 @@ def compile_time(repeats: int = 5) -> list[Benchmark]:
     compile_arm: Any = partial(
         testbed.compiled, horizon=0.5, sample_period=0.05, outputs=[STATE], compile=True, check=False
     )
-    with tempfile.TemporaryDirectory() as folder, _cache(folder):
+    with tempfile.TemporaryDirectory() as folder, environment(XDG_CACHE_HOME=folder):
         first = _processor_time(compile_arm)
         again = float(np.median([_processor_time(compile_arm) for _ in range(repeats)]))
         checked = _processor_time(partial(compile_arm, check=True))
@@ -194,17 +193,3 @@ def _processor_time(function: Callable[[], Any]) -> float:
     function()
     after = [resource.getrusage(kind) for kind in kinds]
     return sum(b.ru_utime + b.ru_stime - a.ru_utime - a.ru_stime for a, b in zip(before, after, strict=True))
-
-
-@contextmanager
-def _cache(folder: str) -> Any:
-    """Keep machine code in a folder."""
-    name, before = "XDG_CACHE_HOME", os.environ.get("XDG_CACHE_HOME")
-    os.environ[name] = folder
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before

@@ -33,13 +33,13 @@ def in_processes(
         yield from ((case, function(case)) for case in cases)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        with _environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"):  # The processes start in this call.
+        with environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"):  # The processes start in this call.
             results = pool.map(function, cases)
         yield from zip(cases, results, strict=True)
 
 
 @contextmanager
-def _environment(**values: str) -> Iterator[None]:
+def environment(**values: str) -> Iterator[None]:
     """Set variables of the environment, for processes that are started meanwhile."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)

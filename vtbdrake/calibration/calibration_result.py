@@ -15,8 +15,8 @@ from vtbdrake import upper_layers
 from vtbdrake.calibration.filtering import Noise
 from vtbdrake.calibration.fisher import Information
 from vtbdrake.calibration.fit_curves import FitCurves
+from vtbdrake.calibration.report_page import save_page
 from vtbdrake.common.argument_checks import counted
-from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.pedigree import Number, Posterior
 
@@ -142,9 +142,7 @@ class Calibration:
 
     def save_html(self, path: str | os.PathLike[str]) -> None:
         """Write one HTML file with the numbers, their verdicts, and plots."""
-        page = f'<!doctype html><meta charset="utf-8"><title>Calibration</title>{self._repr_html_()}'
-        with whole_file(path) as partial:
-            partial.write_text(page, encoding="utf-8")
+        save_page(path, "Calibration", self._repr_html_())
 
 
 def calibrated_scenario(

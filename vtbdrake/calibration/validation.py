@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from html import escape
 from math import acos, hypot, inf, isnan, nan, pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,12 +13,12 @@ import numpy as np
 import scipy
 
 from vtbdrake import upper_layers
+from vtbdrake.calibration.report_page import save_page
 from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
-from vtbdrake.state.archive import whole_file
 from vtbdrake.state.variables import text_table
 
 if TYPE_CHECKING:
@@ -152,9 +151,7 @@ class Comparison:
 
     def save_html(self, path: str | os.PathLike[str]) -> None:
         """Write one HTML file with verdict, numbers and plots."""
-        page = f'<!doctype html><meta charset="utf-8"><title>{escape(self.source)}</title>{self._repr_html_()}'
-        with whole_file(path) as partial:
-            partial.write_text(page, encoding="utf-8")
+        save_page(path, self.source, self._repr_html_())
 
 
 def compare(

@@ -450,7 +450,7 @@ class AddressedSystem(_LeafSystem):
                 update: The function of the update.
             """
             super().DeclarePeriodicDiscreteUpdateEvent(period_sec, offset_sec, update)
-            self.timings = (*self.timings, (float(period_sec), float(offset_sec)))
+            self._remember_timing(period_sec, offset_sec)
 
         def DeclarePeriodicUnrestrictedUpdateEvent(self, period_sec: float, offset_sec: float, update: Any) -> None:
             """Declare an unrestricted update, as Drake does, and remember its timing.
@@ -461,7 +461,10 @@ class AddressedSystem(_LeafSystem):
                 update: The function of the update.
             """
             super().DeclarePeriodicUnrestrictedUpdateEvent(period_sec, offset_sec, update)
-            self.timings = (*self.timings, (float(period_sec), float(offset_sec)))
+            self._remember_timing(period_sec, offset_sec)
+
+    def _remember_timing(self, period: float, offset: float) -> None:
+        self.timings = (*self.timings, (float(period), float(offset)))
 
     def _not_holding_any(
         self, arguments: Iterable[Any], options: Mapping[str, Any]

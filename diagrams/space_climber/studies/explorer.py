@@ -30,19 +30,19 @@ from vtbdrake_diagrams.space_climber.studies.crater import HEADING, WALK
 from vtbdrake_diagrams.space_climber.studies.rover import Rover, true_world
 
 PLACE = ("sim.sys.climber.base.x", "sim.sys.climber.base.y")
-"""Where the robot is, in m."""
+"""The addresses of the robot's place in the simulated world, x and y in m."""
 
 TRIED = 28.0
 """Horizon of a rollout in s: longer than a leg, so that it does not end in front of a rock."""
 
 WIDEST_TRIED = np.radians(80.0)
-"""How far beside the x axis headings are tried, in rad."""
+"""Headings are tried up to this angle beside the x axis, in rad."""
 
 CANDIDATES = 9
-"""How many headings are tried beside the one along the route, 20 deg apart."""
+"""The number of headings, 20 deg apart, that are tried beside the one along the route."""
 
 SPEED = 0.19
-"""What the robot walks on level ground, in m/s."""
+"""The robot's speed on level ground, in m/s."""
 
 ENOUGH = 0.75
 """The share of the best that is possible from which on no other headings are tried."""
@@ -54,12 +54,12 @@ TRIED_BACKWARDS = 1.0
 """If no heading gains as much, in m, walking backwards is tried, too."""
 
 RADIUS = SPEED * TRIED + 3.0
-"""How far a mental world reaches, in m."""
+"""The radius of a mental world around the robot, in m."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """What the robot knew and did at one stop.
+    """A stop of the robot: what it knew there, and what it decided.
 
     Attributes:
         time: Simulated time in s.

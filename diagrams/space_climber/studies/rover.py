@@ -23,7 +23,7 @@ from vtbdrake_diagrams.space_climber.studies.crater import HEADING, MASS, POSE, 
 from vtbdrake_diagrams.space_climber.terrain import crater_shapes
 
 SEGMENT = 5.0
-"""How long the simulated reality goes on in one call, in s."""
+"""The time that one call simulates of the reality, in s."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,13 @@ class Ground:
 
 
 FEW_ROCKS = Ground("few rocks", rock_cover=0.03, longest=600.0, first_seed=1300)
-"""As at the least rocky landing sites. Without a detour the way takes a little more than 300 s, so there is time for
-one. With 450 s, as it was for craters below 1300, walks were cut that still gained; see docs/crater.md."""
+"""Craters with the rock cover of the least rocky landing sites. Without a detour the way takes a little more than
+300 s, so there is time for one. With 450 s, as it was for craters below 1300, walks were cut that still gained; see
+docs/crater.md."""
 
 MANY_ROCKS = Ground("many rocks", rock_cover=0.07, longest=900.0, first_seed=1500)
-"""More than at the least rocky landing sites, and less than half of what the rockiest have; see `terrain`. There is
-time for two detours, as was chosen in craters 1000 to 1031."""
+"""Craters with more rocks than the least rocky landing sites, and fewer than the rockiest; see `terrain`. There is time
+for two detours, as was chosen in craters 1000 to 1031."""
 
 GROUNDS = (FEW_ROCKS, MANY_ROCKS)
 
