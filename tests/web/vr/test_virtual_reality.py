@@ -80,7 +80,7 @@ class Headset:
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Read statuses until one fulfils the condition."""
         while not condition(self.status):
-            self._read()
+            assert (message := self._read())["type"] == "status", message
         return self.status
 
     def error(self) -> str:
@@ -130,6 +130,8 @@ def running(opened: View) -> Iterator[View]:
     yield opened
     headset = Headset(opened)
     headset.send({"do": "disarm"})
+    headset.send({"do": "nothing"})  # It is answered after what was sent before: the next test is not disarmed.
+    assert "no command" in headset.error()
     headset.until(lambda status: status["armed"] is False and status["leading"] is False)
     headset.close()
 
