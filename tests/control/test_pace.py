@@ -130,9 +130,18 @@ class PacingBridge(ScriptedBridge):
         self.stamped = stamped  # the time between two messages by the machine's own clock
         self.due = 0.0
         self.number = 0
+        self.waits = False  # for a command before it sends again
+        self.blocked_until = 0.0
+
+    @property
+    def blocked_reason(self) -> str | None:
+        return "another client commands" if self._clock.now() < self.blocked_until else None
 
     def poll(self, timeout: float = 0.0) -> int:
         now = self._clock.now()
+        if self.waits and self.number > len(self.sent):
+            self._clock.wait_until(now + timeout)
+            return 0
         if now < self.due and not timeout:
             return 0
         self._clock.wait_until(min(max(self.due, now), now + timeout))
@@ -301,6 +310,43 @@ def test_in_lock_step_the_loop_leaves_with_one_command() -> None:
     assert clock.now() == begin and len(bridge.sent) == count + 1
     last = [command["velocity"] for _, command in bridge.sent[-2:]]
     assert np.abs(last[1] - last[0]).max() == pytest.approx(RATE * PERIOD)
+
+
+def waiting(blocked_until: float) -> tuple[Runtime, PacingBridge, SimulatedClock]:
+    """A machine in lock-step that sends nothing more before it gets a command, and is blocked until a time."""
+    runtime, bridge, clock = paced(PERIOD, lock_step=True, stamped=PERIOD)
+    bridge.waits, bridge.blocked_until = True, blocked_until
+    return runtime, bridge, clock
+
+
+def test_in_lock_step_a_reason_against_the_switch_may_end_while_the_machine_waits() -> None:
+    runtime, bridge, clock = waiting(blocked_until=0.33)
+    runtime.take_over(timeout=2.0)
+    assert 0.33 <= clock.now() < 0.5  # Its patience would be 1,000 s.
+    assert runtime.cycles == 2 and len(bridge.sent) == 1  # No cycle of the DPS without one of the machine.
+    runtime.run(cycles=10)
+    assert len(bridge.sent) == 11 and runtime.guards.latched == ()
+
+
+def test_in_lock_step_a_take_over_keeps_its_timeout() -> None:
+    runtime, bridge, clock = waiting(blocked_until=inf)
+    with pytest.raises(SwitchRefusedError, match=r"after 2\.\d s: .*another client commands"):
+        runtime.take_over(timeout=2.0)
+    assert 2.0 <= clock.now() < 2.2 and bridge.sent == []
+
+
+def test_in_lock_step_a_loop_that_waits_can_be_stopped() -> None:
+    runtime, bridge, clock = waiting(blocked_until=inf)
+    runtime.run(cycles=1)
+
+    def until_stopped(timeout: float = 0.0) -> int:
+        if clock.now() > 5.0:
+            runtime.stop()
+        return PacingBridge.poll(bridge, timeout)
+
+    bridge.poll = until_stopped  # type: ignore[method-assign]
+    runtime.run(seconds=100.0)
+    assert runtime.cycles == 1 and 5.0 < clock.now() < 5.5
 
 
 def test_in_lock_step_without_stamps_every_message_is_a_period() -> None:

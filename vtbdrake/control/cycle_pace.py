@@ -17,7 +17,7 @@ from vtbdrake.control.statistics import LoopStatistics
 _log = logging.getLogger(__name__)
 
 _KEEP_PERIOD = 0.1
-"""Time between two messages that keep command channels while a loop waits, in seconds."""
+"""Time between two messages that keep command channels while a loop waits, and two looks at whether it is to end."""
 
 _LONG_WAIT = 1.0
 """Time of waiting for a message that begins a cycle after which the log says so, in seconds."""
@@ -56,12 +56,15 @@ class CyclePace(ABC):
         return None
 
     @abstractmethod
-    def wait(self, deadline: float, active: tuple[str, ...]) -> tuple[float, float]:
-        """Wait for the next cycle; return when it was due and how late it is, in seconds.
+    def wait(
+        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
+    ) -> tuple[float, float] | None:
+        """Wait for the next cycle; return when it was due and how late it is, in seconds, or None if none is to begin.
 
         Args:
             deadline: When it is due by the clock, in seconds.
             active: The actuator signals that are on real.
+            ends: Called again and again in a wait that may be long; True ends it without a cycle.
         """
 
     @abstractmethod
@@ -115,7 +118,9 @@ class ClockPace(CyclePace):
         super().__init__(period, clock, statistics)
         self._receive = receive
 
-    def wait(self, deadline: float, active: tuple[str, ...]) -> tuple[float, float]:
+    def wait(
+        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
+    ) -> tuple[float, float] | None:
         # Shortly before the deadline, messages that have arrived are received and fed already.
         return deadline, self._clock.wait_until(deadline, self._receive) - deadline
 
@@ -174,7 +179,9 @@ class MessagePace(CyclePace):
     def problem(self) -> str | None:
         return self._monitor.problem or self._monitor.unknown
 
-    def wait(self, deadline: float, active: tuple[str, ...]) -> tuple[float, float]:
+    def wait(
+        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
+    ) -> tuple[float, float] | None:
         messages, begin = self.messages, self._clock.now()
         limit, keep_at, tell_at = begin + self._patience, begin + _KEEP_PERIOD, begin + _LONG_WAIT
         while self.messages == messages:
@@ -183,6 +190,8 @@ class MessagePace(CyclePace):
                 self._tell_wait(now - begin)
                 tell_at = inf
             if now >= keep_at:
+                if ends():
+                    return None
                 self._bridge.keep(active)
                 keep_at = now + _KEEP_PERIOD
             left = limit - now

@@ -201,6 +201,16 @@ class Runtime(Closing, Stepped):
         """
         if seconds is not None and isnan(seconds):
             raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
+        self._run(cycles, seconds, until)
+
+    def _run(
+        self,
+        cycles: int | None,
+        seconds: float | None,
+        until: Callable[[], bool],
+        meanwhile: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Run cycles as `run` does; ``meanwhile`` is called in long waits for a message, and True ends the run, too."""
         self._stop.clear()
         self._ended.clear()
         self._runner = threading.current_thread()
@@ -209,11 +219,18 @@ class Runtime(Closing, Stepped):
             begins = self._read_waiting()
             begin = self.clock.now()
             deadline, done = begin, 0
+
+            def ends() -> bool:
+                return self._stop.is_set() or meanwhile()
+
             with self._interruptible:
                 while not self._stop.is_set():
                     if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                         return
-                    due, lateness = (deadline, 0.0) if begins else self._pace.wait(deadline, self.active)
+                    begin_of_cycle = (deadline, 0.0) if begins else self._pace.wait(deadline, self.active, ends)
+                    if begin_of_cycle is None:
+                        return
+                    due, lateness = begin_of_cycle
                     begins = False
                     self.cycle(due=due, lateness=lateness, poll=not self._pace.receives)
                     self._interruptible.raise_interrupt()
@@ -238,7 +255,7 @@ class Runtime(Closing, Stepped):
             self._watchers.remove(watcher)
 
     def stop(self) -> None:
-        """End `run` after the present cycle. May be called from any thread."""
+        """End `run` after the present cycle, or in its wait for a message. May be called from any thread."""
         self._stop.set()
 
     @property
@@ -486,7 +503,8 @@ class Runtime(Closing, Stepped):
             throttle(report, "; ".join(preparation.reasons))
             return False
 
-        self.run(until=is_on_real)
+        # A machine in lock-step sends nothing while it is not commanded: the reasons may end without a cycle.
+        self._run(None, None, until=is_on_real, meanwhile=is_on_real)
         if self.pace is not None:
             # At once: a machine in lock-step sends nothing new before it gets an actuator command.
             with self._interruptible:
