@@ -335,9 +335,10 @@ def test_in_lock_step_a_take_over_keeps_its_timeout() -> None:
     assert 2.0 <= clock.now() < 2.2 and bridge.sent == []
 
 
-def test_in_lock_step_a_loop_that_waits_can_be_stopped() -> None:
+def test_in_lock_step_a_loop_that_waits_ends_after_its_time_or_when_it_is_stopped() -> None:
     runtime, bridge, clock = waiting(blocked_until=inf)
-    runtime.run(cycles=1)
+    runtime.run(seconds=3.0)
+    assert runtime.cycles == 1 and 3.0 <= clock.now() < 3.2
 
     def until_stopped(timeout: float = 0.0) -> int:
         if clock.now() > 5.0:

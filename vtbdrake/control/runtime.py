@@ -193,7 +193,7 @@ class Runtime(Closing, Stepped):
 
         Args:
             cycles: Number of cycles.
-            seconds: Time on the clock.
+            seconds: Time on the clock; a wait for a message ends with it.
             until: Called after every cycle; True ends the run.
 
         Raises:
@@ -221,7 +221,8 @@ class Runtime(Closing, Stepped):
             deadline, done = begin, 0
 
             def ends() -> bool:
-                return self._stop.is_set() or meanwhile()
+                is_over = seconds is not None and self.clock.now() - begin >= seconds
+                return is_over or self._stop.is_set() or meanwhile()
 
             with self._interruptible:
                 while not self._stop.is_set():
