@@ -110,12 +110,12 @@ def test_ctrl_c_anywhere_in_a_pool(expected):
 @pytest.mark.one_python
 def test_ctrl_c_in_many_lines_of_processes(expected):
     """Each costs a worker, which takes a second: so every ninth line is interrupted."""
-    before = child_pids()
+    before = set(child_pids())
     modules = worker_processes, child_process, pickled_task
     options = {"lines": True, "every": 9, "warm": (True,)}
     assert survives(lambda: ProcessExecutor(1), expected, *modules, **options) > 4
     gc.collect()
-    assert child_pids() == before
+    assert set(child_pids()) <= before  # Another test's may have ended meanwhile.
 
 
 @pytest.mark.slow

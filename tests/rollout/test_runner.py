@@ -456,7 +456,8 @@ def test_a_scenario_that_is_changed_afterwards_changes_nothing():
     before = problem.rollout([0.5])
     scenario.stiffness = 50.0
     assert problem.rollout([0.5]).identical(before)
-    sweep = problem.sweep(values=[0.5], executor=ProcessExecutor(1), progress=False)
+    with ProcessExecutor(1) as executor:
+        sweep = problem.sweep(values=[0.5], executor=executor, progress=False)
     assert sweep.h[0] == before.h
     assert sweep.scenario["stiffness"] == 0.0
 
