@@ -218,6 +218,12 @@ def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str
     return phrases
 
 
+def unreadable_text(described: Mapping[str, Any]) -> str:
+    """Return a text about changes of a described problem's code that would go unnoticed; empty if none would."""
+    parts = [f"{', '.join(types)} (in {name})" for name, types in described.get("unreadable", {}).items()]
+    return f"changes would go unnoticed inside objects that cannot be read: {'; '.join(parts)}" if parts else ""
+
+
 def _without_code(measures: Any) -> list[dict[str, Any]]:
     return [{key: value for key, value in measure.items() if key != "code"} for measure in measures]
 

@@ -24,6 +24,14 @@ BROKEN = "broken"
 # Racing dropped it.
 DROPPED = "dropped"
 
+# Kinds of interventions that more than their own function knows; see `Study.intervene` for all.
+PAUSE = "pause"
+RESUME = "resume"
+STOP = "stop"
+TRY = "try"
+# What a person tells the process that runs the study; the points do not depend on these.
+CONTROLS = (PAUSE, RESUME, STOP)
+
 # (point, number of the condition)
 RolloutKey = tuple[Point, int]
 

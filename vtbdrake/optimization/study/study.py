@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import getpass
-import logging
 import os
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
-
-import numpy as np
 
 from vtbdrake import upper_layers
 from vtbdrake.common.argument_checks import all_of, as_flag, as_whole, check_takes, counted
@@ -21,32 +16,26 @@ from vtbdrake.common.extras import extra_module
 from vtbdrake.common.failures import safe_text
 from vtbdrake.common.interrupt import interrupt_taken
 from vtbdrake.common.summary_html import summary_html
-from vtbdrake.optimization.identity import (
-    adds_conditions,
-    code_changes,
-    describe,
-    differences,
-    plain,
-    revision,
-    versions,
-)
-from vtbdrake.optimization.parameter import Choice, Dimension, checked_point, point_text, short_address
-from vtbdrake.optimization.pareto import undominated
-from vtbdrake.optimization.records import DrivenTrial, Intervention, Outcome, RolloutKey, Trial
-from vtbdrake.optimization.statement import statement
-from vtbdrake.optimization.study.interventions import (
-    CONTROLS,
+from vtbdrake.optimization.identity import plain, revision, versions
+from vtbdrake.optimization.parameter import Dimension, checked_point
+from vtbdrake.optimization.records import (
     PAUSE,
     RESUME,
     STOP,
     TRY,
-    FollowedSearch,
-    StudySearch,
-    check_arguments,
+    DrivenTrial,
+    Intervention,
+    Outcome,
+    RolloutKey,
+    Trial,
 )
+from vtbdrake.optimization.study.begin_or_resume import begin_or_resume
+from vtbdrake.optimization.study.interventions import Interventions, name_of_person, repeated_interventions
 from vtbdrake.optimization.study.study_error import StudyError
-from vtbdrake.optimization.study.study_file import StudyFile
-from vtbdrake.optimization.study.study_run import BUDGET, INTERRUPTED, SOLVER, TARGET, StudyRun, check_budget
+from vtbdrake.optimization.study.study_file import INTERRUPTED, StudyFile
+from vtbdrake.optimization.study.study_results import StudyResults, distinct_names
+from vtbdrake.optimization.study.study_run import StudyRun, check_budget, renew_solver
+from vtbdrake.optimization.study.study_search import StudySearch
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Executor, RolloutResult
 from vtbdrake.rollout.course import Course
@@ -61,8 +50,6 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization.problem import Problem
     from vtbdrake.upper_layers import StudyView
-
-_log = logging.getLogger(__name__)
 
 # A function that is called with a study and each of its new trials.
 Callback = Callable[["Study", Trial], Any]
@@ -93,7 +80,7 @@ class Study(Closing):
         self._file = file
         self._problem = problem
         self._meta = file.meta
-        self._followed = FollowedSearch(file)
+        self._interventions = Interventions(file)
         self.reason = ""
         self.message = ""
 
@@ -133,35 +120,10 @@ class Study(Closing):
             more_conditions: Whether the problem may have further conditions behind the file's.
         """
         requested = {"solver": solver, "seed": seed, "options": options, "parallel": parallel}
-        meta = _begun(problem, requested)
-        study = cls(StudyFile(path, meta=meta), problem)
-        try:
-            extended = more_conditions and adds_conditions(study._meta["problem"], meta["problem"])
-            if not extended:
-                _refuse_other_problem(path, study._meta["problem"], meta["problem"])
-            code = code_changes(study._meta["problem"], meta["problem"])
-            if code and not allow_changed_code:
-                raise StudyError(
-                    f"{path} was made with other code ({'; '.join(code)}): give another file, restore the code, or, if "
-                    "its rollouts would come out the same, go on with allow_changed_code=True"
-                )
-            for key, value in requested.items():
-                if value is not None and study._meta.get(key) != meta[key]:
-                    raise StudyError(
-                        f"{path} was begun with {key} {study._meta.get(key)!r}, not {meta[key]!r}: leave {key} out to "
-                        "resume it, or give another file"
-                    )
-            if blind := _unreadable(meta["problem"]):
-                _log.warning("%s", blind)
-            if code:
-                study._file.change_code(meta["problem"], code, versions=meta["versions"], revision=meta["revision"])
-            if extended:
-                study._file.add_conditions(meta["problem"])
-            study._meta = study._file.meta
-        except BaseException:
-            study.close()
-            raise
-        return study
+        file = begin_or_resume(
+            problem, path, requested, allow_changed_code=allow_changed_code, more_conditions=more_conditions
+        )
+        return cls(file, problem)
 
     def close(self) -> None:
         """Close the file."""
@@ -178,7 +140,7 @@ class Study(Closing):
         drawn = any(trial.counts for trial in self.trials)
         return summary_html(first, rows, self.plot_history() if drawn else None)
 
-    # -- running it
+    # -- runs
 
     def run(
         self,
@@ -244,6 +206,73 @@ class Study(Closing):
         )
         return self
 
+    def replay(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        without: Sequence[int] = (),
+        reuse: bool = True,
+        executor: str | Executor | FuturesExecutor = "auto",
+        workers: int | None = None,
+        time_limit: float | None = None,
+        on_error: str = "record",
+        progress: bool = True,
+    ) -> Study:
+        """Repeat the study from its first batch, into another file, and return it.
+
+        With all interventions the trials come out the same, to the last bit, up to the end of this study. (Trials that
+        an earlier solver made for a smaller budget are left out.) Without some of them it is the study as it would
+        have been, until its budget is spent. Pauses and stops are not repeated.
+
+        Args:
+            path: Path of the new file; None keeps the study in memory.
+            without: The numbers of the interventions to leave out.
+            reuse: Whether rollouts that this study has finished are taken over, and not run again.
+            executor: See `run`, as for the arguments below.
+            workers: See `run`.
+            time_limit: See `run`.
+            on_error: See `run`.
+            progress: See `run`.
+
+        Raises:
+            StudyError: The study was opened without its problem, has not run yet, or the new file exists.
+            ValueError: There is no such intervention, or a later one makes no sense without it.
+        """
+        if self._problem is None:
+            raise self._no_problem()
+        meta = self._file.meta
+        if "racing" not in meta:
+            raise StudyError(f"{self.path or 'the study'} has not run yet: there is nothing to replay")
+        if path is not None and Path(path).exists():
+            raise StudyError(f"{path} exists already: a study is replayed into a new file")
+        without = all_of(int, without, name="without", form="numbers of interventions")
+        changes = repeated_interventions(StudySearch.of(meta), self.interventions, without=without)
+        study = Study(StudyFile(path, meta=self._file.description), self._problem)
+        study._file.copy_interventions(changes)
+        study._run(
+            {"rollouts": len(self) if not without or meta["budget"] is None else meta["budget"]},
+            executor=executor,
+            workers=workers,
+            time_limit=time_limit,
+            racing=meta["racing"],
+            catch=catches(on_error),
+            progress=progress,
+            callbacks=(),
+            outcomes=self.rollouts if reuse else {},
+            batches=None if without else self._file.batches(),
+        )
+        return study
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether a process runs the study, this one or another."""
+        return self._file.is_running
+
+    @property
+    def sessions(self) -> tuple[Mapping[str, Any], ...]:
+        """Return every run: started, ended and reason (None if it was killed), versions and git revision."""
+        return tuple(self._file.sessions())
+
     def _run(
         self,
         budget: dict[str, Any],
@@ -265,7 +294,8 @@ class Study(Closing):
 
         def run() -> str:
             if "outcomes" not in settings:  # A replay has the solver of the other study.
-                self._begin_solver(rollouts, racing=racing)
+                renew_solver(self._file, self.search, rollouts=rollouts, racing=racing)
+                self._meta = self._file.meta
             study_run = StudyRun(self._file, problem, opened, racing=racing, after_batch=after_batch, **settings)
             self.reason, self.message = study_run.until(**budget)
             return self.reason
@@ -276,17 +306,10 @@ class Study(Closing):
         if self.reason == INTERRUPTED:
             interrupt_taken()
 
-    def _begin_solver(self, rollouts: int | None, *, racing: bool) -> None:
-        """Let the solver begin from its first batch if the budget is larger than the one for which it was made."""
-        self._meta = self._file.meta
-        made_for, raced = self._meta.get("budget", 0), self._meta.get("racing")
-        # A larger budget may be another sequence of points; a smaller one only ends the same sequence earlier.
-        larger = made_for is not None and (rollouts is None or rollouts > made_for)
-        if raced is not None and self.search.budget_from is not None:
-            larger = False  # The budget comes from an intervention.
-        if larger or racing != raced:
-            self._file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
-            self._meta = self._file.meta
+    def _no_problem(self) -> StudyError:
+        return StudyError(
+            f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
+        )
 
     # -- interventions
 
@@ -332,137 +355,20 @@ class Study(Closing):
             payload["value"] = self.best.parameters[self.search.parameter(payload.get("address"))[1].address]
         if kind == TRY and "point" in payload:
             payload["point"] = _by_address(self.parameters, payload["point"])
-        (intervention,) = self._intervene(kind, [payload], by=by)
+        (intervention,) = self._interventions.make(kind, [payload], name=name_of_person(by))
         return intervention
-
-    def _intervene(self, kind: str, payloads: Sequence[dict[str, Any]], *, by: str | None) -> list[Intervention]:
-        for payload in payloads:
-            check_arguments(kind, payload)
-        self._refuse_if_finished(kind)
-        stored = [plain(payload, f"the arguments of {kind}") for payload in payloads]
-        return self._file.intervene(kind, stored, name=safe_text(by) if by else _user(), check=self._check_added)
-
-    def _check_added(self, interventions: Sequence[Intervention]) -> None:
-        """Check interventions behind all others. Points that wait stay valid: the widest ranges only grow."""
-        search = self.search.after(interventions)
-        if any(intervention.kind != TRY for intervention in interventions):
-            search.check()
-        _check_points(search, interventions)
-
-    def _check_changed(self, before: Intervention, after: Intervention | None) -> None:
-        """Check what an intervention that waits has become."""
-        if before.kind == TRY:
-            _check_points(self.search, [] if after is None else [after])
-            return
-        # Not by what was read before: the change may be taken back.
-        search = StudySearch.of(self._file.meta).after(self._file.interventions())
-        search.check()
-        # A range may not be that wide any more.
-        _check_points(search, self._file.interventions(waiting=True))
-
-    def _refuse_if_finished(self, kind: str) -> None:
-        if self.is_running:
-            return
-        if kind == STOP:
-            raise StudyError(f"no process runs {self.path or 'the study'}: there is nothing to stop")
-        if kind in (RESUME, TRY, "budget") or self._budget_waits():
-            return
-        session = self._file.last_session()
-        reason = session["reason"] if session is not None else None
-        if reason not in (BUDGET, TARGET, SOLVER):
-            return
-        if kind == PAUSE or reason == BUDGET:
-            raise StudyError(
-                f"{self.path or 'the study'} is finished (its last run ended by {reason}, with {len(self)} rollouts): "
-                "give it a larger budget first"
-            )
-
-    def _budget_waits(self) -> bool:
-        """Return whether the newest budget waits for a batch; if any waits, it does."""
-        number = self.search.budget_from
-        budget = None if number is None else self._file.intervention(number)
-        return budget is not None and budget.batch is None
 
     def pause(self, *, by: str | None = None) -> None:
         """Let the run finish its batch of points and wait; see `intervene`."""
-        self.intervene("pause", by=by)
+        self.intervene(PAUSE, by=by)
 
     def resume(self, *, by: str | None = None) -> None:
         """Let a paused run go on; see `intervene`."""
-        self.intervene("resume", by=by)
+        self.intervene(RESUME, by=by)
 
     def stop(self, *, by: str | None = None) -> None:
         """End the run after the present batch of points; may be called by a callback, or anywhere else."""
         self.intervene(STOP, by=by)
-
-    def replay(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        without: Sequence[int] = (),
-        reuse: bool = True,
-        executor: str | Executor | FuturesExecutor = "auto",
-        workers: int | None = None,
-        time_limit: float | None = None,
-        on_error: str = "record",
-        progress: bool = True,
-    ) -> Study:
-        """Repeat the study from its first batch, into another file, and return it.
-
-        With all interventions the trials come out the same, to the last bit, up to the end of this study. (Trials that
-        an earlier solver made for a smaller budget are left out.) Without some of them it is the study as it would
-        have been, until its budget is spent. Pauses and stops are not repeated.
-
-        Args:
-            path: Path of the new file; None keeps the study in memory.
-            without: The numbers of the interventions to leave out.
-            reuse: Whether rollouts that this study has finished are taken over, and not run again.
-            executor: See `run`, as for the arguments below.
-            workers: See `run`.
-            time_limit: See `run`.
-            on_error: See `run`.
-            progress: See `run`.
-
-        Raises:
-            StudyError: The study was opened without its problem, has not run yet, or the new file exists.
-            ValueError: There is no such intervention, or a later one makes no sense without it.
-        """
-        if self._problem is None:
-            raise self._no_problem()
-        meta = self._file.meta
-        if "racing" not in meta:
-            raise StudyError(f"{self.path or 'the study'} has not run yet: there is nothing to replay")
-        if path is not None and Path(path).exists():
-            raise StudyError(f"{path} exists already: a study is replayed into a new file")
-        without = all_of(int, without, name="without", form="numbers of interventions")
-        changes = [i for i in self.interventions if i.kind not in CONTROLS and i.batch is not None]
-        numbers = [intervention.number for intervention in changes]
-        for number in without:
-            if number not in numbers:
-                raise ValueError(f"no intervention {number} can be left out; those with an effect are: {numbers}")
-        changes = [intervention for intervention in changes if intervention.number not in without]
-        search = StudySearch.of(meta)
-        for intervention in changes:
-            search = search.after([intervention])
-            if intervention.kind != TRY:
-                search.check()
-            else:
-                checked_point(search.widest, intervention.payload["point"])
-        study = Study(StudyFile(path, meta=self._file.description), self._problem)
-        study._file.copy_interventions(changes)
-        study._run(
-            {"rollouts": len(self) if not without or meta["budget"] is None else meta["budget"]},
-            executor=executor,
-            workers=workers,
-            time_limit=time_limit,
-            racing=meta["racing"],
-            catch=catches(on_error),
-            progress=progress,
-            callbacks=(),
-            outcomes=self.rollouts if reuse else {},
-            batches=None if without else self._file.batches(),
-        )
-        return study
 
     @property
     def interventions(self) -> tuple[Intervention, ...]:
@@ -472,30 +378,9 @@ class Study(Closing):
     @property
     def search(self) -> StudySearch:
         """Return the ranges, regions, solver and budget, as the interventions so far leave them."""
-        return self._followed.now()
+        return self._interventions.search
 
-    @property
-    def is_running(self) -> bool:
-        """Return whether a process runs the study, this one or another."""
-        return self._file.is_running
-
-    @property
-    def problem(self) -> Problem:
-        """Return the problem, with the widest ranges that the study has had: all its points lie in them.
-
-        Raises:
-            StudyError: The study was opened without its problem.
-        """
-        if self._problem is None:
-            raise self._no_problem()
-        return self._problem.with_ranges(self.parameters)
-
-    def _no_problem(self) -> StudyError:
-        return StudyError(
-            f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
-        )
-
-    # -- points and attributes given by hand
+    # -- points, driven rollouts and attributes given by hand
 
     def add(self, *points: Any, by: str | None = None) -> None:
         """Add points by hand, each a mapping address -> value or values in the order of the parameters.
@@ -512,7 +397,8 @@ class Study(Closing):
             ValueError: A point has other entries than the study, or one lies outside its range.
         """
         parameters = self.parameters
-        self._intervene(TRY, [{"point": _by_address(parameters, point)} for point in points], by=by)
+        payloads = [{"point": _by_address(parameters, point)} for point in points]
+        self._interventions.make(TRY, payloads, name=name_of_person(by))
 
     def add_results(self, point: Any, results: Sequence[RolloutResult], *, by: str | None = None) -> Intervention:
         """Add a point by hand whose rollouts were run elsewhere, for example by `Problem.rollout` in another process.
@@ -556,7 +442,7 @@ class Study(Closing):
         if differing := record_differences(self._meta["problem"]["scenario"], course.start.scenario, where="there"):
             raise ValueError(f"the course is one of another scenario ({'; '.join(differing)})")
         values = plain({address: parameters[address] for address in addresses}, "the parameters of a driven trial")
-        return self._file.add_drive(values, Outcome.of(result), course, name=safe_text(by) if by else _user())
+        return self._file.add_drive(values, Outcome.of(result), course, name=name_of_person(by))
 
     @property
     def driven(self) -> tuple[DrivenTrial, ...]:
@@ -575,8 +461,7 @@ class Study(Closing):
             ValueError: As in `add`.
         """
         payload = {"point": _by_address(self.parameters, point)}
-        number = as_whole("the number of a point in the queue", number)
-        self._file.change_waiting(number, payload, kind=TRY, check=self._check_changed)
+        self._interventions.change_waiting(as_whole("the number of a point in the queue", number), payload, kind=TRY)
 
     def remove(self, number: int) -> None:
         """Remove a point from the `queue`, or another intervention that waits for its batch.
@@ -585,7 +470,7 @@ class Study(Closing):
             StudyError: No intervention of that number waits: it had its effect, was removed, or was never made.
             ValueError: A later intervention makes no sense without it.
         """
-        self._file.change_waiting(as_whole("the number of an intervention", number), None, check=self._check_changed)
+        self._interventions.change_waiting(as_whole("the number of an intervention", number), None)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
         """Set an attribute of the study, or of a point: for example an operator or a remark. No result changes.
@@ -616,9 +501,15 @@ class Study(Closing):
     # -- description
 
     @property
-    def sessions(self) -> tuple[Mapping[str, Any], ...]:
-        """Return every run: started, ended and reason (None if it was killed), versions and git revision."""
-        return tuple(self._file.sessions())
+    def problem(self) -> Problem:
+        """Return the problem, with the widest ranges that the study has had: all its points lie in them.
+
+        Raises:
+            StudyError: The study was opened without its problem.
+        """
+        if self._problem is None:
+            raise self._no_problem()
+        return self._problem.with_ranges(self.parameters)
 
     @property
     def path(self) -> Path | None:
@@ -650,7 +541,7 @@ class Study(Closing):
     @property
     def names(self) -> tuple[str, ...]:
         """Return the names of the qualities, each another one: of two functions of one name, with their variables."""
-        return _distinct_names(self._meta["problem"]["qualities"])
+        return distinct_names(self._meta["problem"]["qualities"])
 
     @property
     def quality_units(self) -> tuple[str, ...]:
@@ -690,34 +581,11 @@ class Study(Closing):
         Raises:
             ValueError: There are several qualities, or no point has a value and keeps the constraints.
         """
-        if len(self.directions) > 1:
-            raise ValueError("several qualities have no single best point: use pareto()")
-        candidates = self._candidates()
-        if not candidates:
-            if not len(self):
-                raise ValueError("no rollout is finished yet: call run()")
-            feasible = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
-            raise ValueError(f"no point has a quality{feasible}{self._failures()}")
-        (sign,) = self.signs
-        return max(candidates, key=lambda trial: sign * trial.value)
+        return self._results.best()
 
     def pareto(self) -> tuple[Trial, ...]:
         """Return the points that no other point beats in one quality without losing in another."""
-        candidates = self._candidates()
-        values = np.array([trial.values for trial in candidates]).reshape(len(candidates), len(self.signs))
-        front = undominated(np.array(self.signs) * values)
-        return tuple(trial for trial, best in zip(candidates, front, strict=True) if best)
-
-    def _candidates(self) -> list[Trial]:
-        allows = self.search.allows
-        return [trial for trial in self.trials if trial.counts and allows(trial.point)]
-
-    def _failures(self) -> str:
-        messages = [outcome.message for outcome in self.rollouts.values() if outcome.failed]
-        if not messages:
-            return ""
-        first = "" if len(set(messages)) == 1 else ", the first"
-        return f"; {counted(len(messages), 'rollout')} failed{first}: {messages[0]}"
+        return self._results.pareto()
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Return columns by name, one entry per trial.
@@ -725,18 +593,7 @@ class Study(Closing):
         The columns are the parameters by address, the qualities, the violations of the constraints, the origin of the
         trial (solver or user, method, batch), and its attributes (None if it does not have one).
         """
-        trials = self.trials
-        columns: dict[str, list[Any]] = {d.address: [t.parameters[d.address] for t in trials] for d in self.parameters}
-        for k, name in enumerate(self.names):
-            columns[name if name not in columns else f"{name} {k}"] = [t.values[k] for t in trials]
-        for k, constraint in enumerate(self._meta["problem"]["constraints"]):
-            name = f"violation of {constraint['name']}"
-            columns[name if name not in columns else f"{name} {k}"] = [t.violations[k] for t in trials]
-        for name in ("feasible", "exact", "origin", "method", "batch"):
-            columns[name] = [getattr(trial, name) for trial in trials]
-        for key in dict.fromkeys(key for trial in trials for key in trial.attributes):
-            columns[f"attribute {key}"] = [trial.attributes.get(key) for trial in trials]
-        return columns
+        return self._results.columns()
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the columns of `to_dict` as a DataFrame, one row per trial; its index is `Trial.number`.
@@ -750,51 +607,11 @@ class Study(Closing):
 
     def summary(self) -> str:
         """Return a text with the progress, the results and the errors."""
-        trials, outcomes = self.trials, self.rollouts
-        methods = Counter(trial.method for trial in trials)
-        lines = [
-            f"{counted(len(trials), 'point')}, {counted(len(outcomes), 'rollout')}; solver {self._meta['solver']}, "
-            f"seed {self._meta['seed']}{self._width}: "
-            + ", ".join(f"{method} ({count})" for method, count in methods.items())
-        ]
-        for change in self._meta.get("changes", []):
-            lines.append(f"the code changed on {change['at'][:10]}: {'; '.join(change['what'])}")
-        if blind := _unreadable(self._meta["problem"]):
-            lines.append(blind)
-        if self.message:
-            lines.append(f"ended: {self.message}")
-        lines.append(self._result())
-        dropped = sum(not trial.exact for trial in trials)
-        if dropped:
-            saved = len(trials) * len(self._meta["problem"]["conditions"]) - len(outcomes)
-            lines.append(
-                f"racing dropped {counted(dropped, 'point')} before all conditions had run, "
-                f"{counted(saved, 'rollout')} less"
-            )
-        ends = Counter(outcome.end for outcome in outcomes.values())
-        times = sorted(outcome.wall_time for outcome in outcomes.values() if outcome.wall_time == outcome.wall_time)
-        if times:
-            lines.append(
-                f"rollouts took {sum(times):.3g} s in all, the median {times[len(times) // 2]:.3g} s; they ended by "
-                + ", ".join(f"{end} ({count})" for end, count in ends.items())
-                + self._failures()
-            )
-        return "\n".join(lines)
+        return self._results.summary(self.message)
 
     @property
-    def _width(self) -> str:
-        parallel = self._meta.get("parallel")
-        return "" if parallel is None else f", {parallel} rollouts side by side"
-
-    def _result(self) -> str:
-        """Return the best point, or the size of the Pareto front, in a line."""
-        if len(self.directions) > 1:
-            return f"Pareto front of {counted(len(self.pareto()), 'point')}"
-        try:
-            best = self.best
-        except ValueError as error:
-            return f"best: {error}"
-        return f"best: {self.names[0]} = {best.value:g} at {point_text(self.parameters, best.point, self.units)}"
+    def _results(self) -> StudyResults:
+        return StudyResults(self._file, self._meta, self.search)
 
     # -- pictures and exports
 
@@ -876,91 +693,6 @@ class Study(Closing):
         return len(points)
 
 
-def _distinct_names(qualities: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the names of the functions; with what they read where names alone are equal, and at last with numbers."""
-    names = tuple(str(quality["name"]) for quality in qualities)
-    if len(set(names)) == len(names):
-        return names
-    addresses = {address for quality in qualities for address in quality["of"]}
-    read = [", ".join(short_address(address, addresses) for address in quality["of"]) for quality in qualities]
-    names = tuple(f"{name} of {variables}" for name, variables in zip(names, read, strict=True))
-    if len(set(names)) == len(names):
-        return names
-    names = tuple(f"{name} ({quality['reading']})" for name, quality in zip(names, qualities, strict=True))
-    return names if len(set(names)) == len(names) else tuple(f"{name} {k}" for k, name in enumerate(names, 1))
-
-
-def _unreadable(problem: Mapping[str, Any]) -> str:
-    """Return a text about changes of a problem's code that would go unnoticed; empty if none would."""
-    parts = [f"{', '.join(types)} (in {name})" for name, types in problem.get("unreadable", {}).items()]
-    return f"changes would go unnoticed inside objects that cannot be read: {'; '.join(parts)}" if parts else ""
-
-
-def _check_points(search: StudySearch, interventions: Sequence[Intervention]) -> None:
-    """Check that the points that interventions try lie within the widest ranges.
-
-    Raises:
-        ValueError: One does not.
-    """
-    for intervention in interventions:
-        if intervention.kind == TRY:
-            checked_point(search.widest, intervention.payload["point"])
-
-
 def _by_address(parameters: Sequence[Dimension], point: Any) -> dict[str, Any]:
     """Check a point and return its values by address."""
     return {p.address: value for p, value in zip(parameters, checked_point(parameters, point), strict=True)}
-
-
-def _begun(problem: Problem, requested: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the contents of the file of a new study: the problem, the solver and the software.
-
-    Raises:
-        ValueError: The solver is unknown, cannot solve the problem, or does not take what is requested.
-    """
-    options, parallel, seed = requested["options"], requested["parallel"], requested["seed"]
-    if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
-    if parallel is not None and as_whole("parallel", parallel) < 1:
-        raise ValueError(f"parallel is the number of rollouts side by side, at least one, not {parallel}")
-    meta: dict[str, Any] = {
-        "problem": describe(problem),
-        "solver": "auto" if requested["solver"] is None else requested["solver"],
-        "seed": 0 if seed is None else as_whole("a seed", seed),
-        "options": plain(options or {}, "the options of its solver"),
-        "parallel": None if parallel is None else as_whole("parallel", parallel),
-        "versions": versions(),
-        "revision": revision(problem.scenario),
-        "units": list(problem.units),
-        "quality_units": [quality.unit for quality in problem.objectives],
-        "statement": statement(problem),
-        "limits": _limits(problem),
-    }
-    solver = StudySearch.of(meta).make_solver()
-    solver.close()
-    return {**meta, "solver": solver.name}
-
-
-def _refuse_other_problem(path: Any, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-    if changed := differences(theirs, ours):
-        raise StudyError(
-            f"{path} is a study of another problem ({'; '.join(changed)}): give another file, or restore the problem"
-        )
-
-
-def _limits(problem: Problem) -> list[list[float] | None]:
-    """Return the bounds of the varied variables; None for a choice, and for a field of the scenario."""
-    variables = problem.testbed.variables()
-    return [
-        None
-        if parameter.is_field or isinstance(parameter, Choice)
-        else [float(np.asarray(bound)) for bound in variables[parameter.address].bounds]
-        for parameter in problem.parameters
-    ]
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # A container may have a user without a name.
-        return f"user {os.getuid()}"

@@ -15,16 +15,24 @@ from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.optimization.records import DrivenTrial, Intervention, Outcome, RolloutKey, Trial
+from vtbdrake.optimization.records import TRY, DrivenTrial, Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study.claim import claimed, is_claimed
 from vtbdrake.optimization.study.database import Database, Schema
-from vtbdrake.optimization.study.interventions import TRY
 from vtbdrake.optimization.study.study_error import StudyError
 from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import QUALITY_FAILED
 
 _log = logging.getLogger(__name__)
+
+# Why a run ended, in a session of the file.
+BUDGET = "budget"
+TIME = "time"
+TARGET = "target"
+SOLVER = "solver"
+INTERRUPTED = "interrupted"
+STOPPED = "stopped"
+REPLAYED = "replayed"
 
 _TABLES = {
     "meta": "key TEXT PRIMARY KEY, value TEXT",

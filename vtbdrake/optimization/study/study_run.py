@@ -15,10 +15,21 @@ from vtbdrake.common.argument_checks import as_number, as_whole
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.optimization.evaluator import ROUND, Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
-from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
+from vtbdrake.optimization.records import CONTROLS, STOP, TRY, Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, ask_within
-from vtbdrake.optimization.study.interventions import CONTROLS, STOP, TRY, FollowedSearch, StudySearch, StudySolver
-from vtbdrake.optimization.study.study_file import StudyFile
+from vtbdrake.optimization.study.interventions import FollowedSearch, search_after
+from vtbdrake.optimization.study.study_file import (
+    BUDGET,
+    INTERRUPTED,
+    REPLAYED,
+    SOLVER,
+    STOPPED,
+    TARGET,
+    TIME,
+    StudyFile,
+)
+from vtbdrake.optimization.study.study_search import StudySearch
+from vtbdrake.optimization.study.study_solver import StudySolver
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.executor import watched
 from vtbdrake.rollout.task import quality_warning
@@ -27,15 +38,6 @@ if TYPE_CHECKING:
     from tqdm.auto import tqdm
 
 _log = logging.getLogger(__name__)
-
-# Why a run ended.
-BUDGET = "budget"
-TIME = "time"
-TARGET = "target"
-SOLVER = "solver"
-INTERRUPTED = "interrupted"
-STOPPED = "stopped"
-REPLAYED = "replayed"
 
 # A solver of a small space may ask for known points for ever; the run ends after this many such batches in a row.
 _KNOWN_BATCHES = 50
@@ -208,7 +210,7 @@ class StudyRun:
         changes = self._changes.get(batch, [])
         # Points that are tried change no search.
         if any(intervention.kind != TRY for intervention in changes):
-            search = self._solver.search.after(changes)
+            search = search_after(self._solver.search, changes)
             # Once more than needed changes nothing: the best point may have been forbidden, or allowed again.
             self._solver.change(search)
             self._evaluator.restrict(search.allows, self._solver.evaluations, budget=search.budget)
@@ -429,6 +431,25 @@ class StudyRun:
             assert self._bar is not None
             (value,) = self._evaluator.in_user_terms(self._evaluator.best)
             self._bar.set_postfix_str(f"best {value:.6g}", refresh=False)
+
+
+def renew_solver(file: StudyFile, search: StudySearch, *, rollouts: int | None, racing: bool) -> None:
+    """Let the solver begin from its first batch if the budget is larger than the one for which it was made.
+
+    Args:
+        file: The file of the study; this process has claimed it.
+        search: The search as the interventions leave it.
+        rollouts: The number of rollouts of the study at the end of the run; None: no limit.
+        racing: Whether points race in the run; a solver goes on only with points that race, or do not, as before.
+    """
+    meta = file.meta
+    made_for, raced = meta.get("budget", 0), meta.get("racing")
+    # A larger budget may be another sequence of points; a smaller one only ends the same sequence earlier.
+    larger = made_for is not None and (rollouts is None or rollouts > made_for)
+    if raced is not None and search.budget_from is not None:
+        larger = False  # The budget comes from an intervention.
+    if larger or racing != raced:
+        file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
 
 
 def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:

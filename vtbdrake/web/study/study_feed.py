@@ -21,8 +21,8 @@ from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.pareto import undominated
 from vtbdrake.optimization.records import DrivenTrial, Intervention
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study.interventions import StudySearch
 from vtbdrake.optimization.study.study_file import Mark, StudyFile
+from vtbdrake.optimization.study.study_search import StudySearch
 from vtbdrake.rollout.task import FAILED
 
 _POLL = 0.2  # s
