@@ -106,7 +106,8 @@ def _in_drake(world: ContactWorld, begin: np.ndarray, times: np.ndarray) -> Outc
 
 
 def _state(rollouts: CompiledRollouts) -> slice:
-    return next(b.entries for b in rollouts.walker.blocks.values() if (b.path, b.kind) == ("plant", "discrete"))
+    blocks = rollouts.walker.vector.blocks.values()
+    return next(b.entries for b in blocks if (b.path, b.kind) == ("plant", "discrete"))
 
 
 def main() -> None:

@@ -189,7 +189,7 @@ def test_a_rollout_that_reaches_a_stop_is_drakes() -> None:
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.3)
     expected = rollouts.walker.read(simulator.get_context())
-    state = rollouts.walker.blocks["plant", DISCRETE, 0].entries
+    state = rollouts.walker.vector.blocks["plant", DISCRETE, 0].entries
     np.testing.assert_allclose(batch.final[1][state], expected[state], atol=1e-9)
     np.testing.assert_allclose(expected[state][0], 0.05, atol=1e-4)  # It rests on its stop.
 

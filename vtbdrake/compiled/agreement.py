@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import Equations
 from vtbdrake.compiled.schedule import Instant
+from vtbdrake.compiled.state_vector import DOUBT, ENDING, ENDING_TIME
 from vtbdrake.compiled.walker import Walker
 from vtbdrake.state.declarations import DISCRETE
 
@@ -77,26 +78,26 @@ def compare(rollouts: CompiledRollouts, begin: Context, *, updates: int = _MOST_
     agreement = max((equations.agreement for equations in walker.equations.values()), default=Equations.agreement)
     z = walker.read(begin)
     batch = rollouts.from_z(np.array([z, _near(walker, z, np.random.default_rng(1), _ASIDE)]), begin.get_time())
-    simulator = Simulator(walker.diagram, begin.Clone())
+    simulator = Simulator(walker.systems.diagram, begin.Clone())
     simulator.Initialize(InitializeParams(suppress_initialization_events=True))
     sample, largest, growth = 0, 0.0, 0.0
     before: tuple[Array, Instant] = z, Instant(begin.get_time(), False, ())
     for instant in rollouts.schedule_at(begin.get_time())[:updates]:
+        message = walker.message(z[ENDING], z[ENDING_TIME])
         if instant.time > begin.get_time():  # Else, the updates of the first instant would happen.
             status = simulator.AdvanceTo(instant.time)
             if status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime:
-                if walker.message(z[-3], z[-4]) != status.FormatMessage():
+                if message != status.FormatMessage():
                     raise CompiledDifferenceError(
                         f"the Diagram ends its simulation, and what is compiled does not: {status.FormatMessage()}; "
                         "keep this testbed in Drake"
                     )
                 break
-        if z[-3] > 0.0:
+        if message:
             raise CompiledDifferenceError(
-                f"what is compiled ends the simulation, and the Diagram does not: {walker.message(z[-3], z[-4])}; keep "
-                "this testbed in Drake"
+                f"what is compiled ends the simulation, and the Diagram does not: {message}; keep this testbed in Drake"
             )
-        if z[-1] > 0.0:
+        if z[DOUBT] > 0.0:
             break  # The plant has felt a joint stop, for example.
         state = simulator.get_context()
         expected = walker.read(state)
@@ -137,7 +138,7 @@ def _hangs_on_rounding(rollouts: CompiledRollouts, step: tuple[Array, Instant], 
     (z, instant), walker, random = step, rollouts.walker, np.random.default_rng(2)
     here = rollouts.advanced(z, instant)
     spread = [rollouts.advanced(_near(walker, z, random, _ASIDE), instant) for _ in range(_TRIALS_ASIDE)]
-    for block in walker.blocks.values():
+    for block in walker.vector.blocks.values():
         if block.kind == DISCRETE:
             difference = _relative(here[block.entries], expected[block.entries])
             largest = max(_relative(each[block.entries], here[block.entries]) for each in spread)
@@ -158,7 +159,7 @@ def _output_difference(address: str, value: Any, expected: Any, time: float, tol
 
 def _difference(walker: Walker, z: Array, expected: Array, time: float) -> float:
     largest = 0.0
-    for block in walker.blocks.values():
+    for block in walker.vector.blocks.values():
         if block.kind == DISCRETE:
             difference = _relative(z[block.entries], expected[block.entries])
             if not difference <= walker.equations[block.path].agreement:
@@ -183,7 +184,7 @@ def _relative(value: Any, expected: Any) -> float:
 def _near(walker: Walker, z: Array, random: np.random.Generator, spread: float) -> Array:
     """Return another vector of state and parameters, a share of it from z; what is compiled in stays."""
     near = z.copy()
-    for block in walker.blocks.values():
+    for block in walker.vector.blocks.values():
         if block.kind == DISCRETE:
             part = near[block.entries]
             finite = np.where(np.isfinite(part), part, 0.0)  # No decision has an infinite time, for example.

@@ -23,6 +23,7 @@ from vtbdrake.compiled.equations import Timing, UnsupportedTestbedError
 from vtbdrake.compiled.plant import TERRAIN
 from vtbdrake.compiled.program import Program, rollout_function
 from vtbdrake.compiled.schedule import Instant, schedule
+from vtbdrake.compiled.state_vector import DOUBT, DOUBT_TIME, ENDING, ENDING_TIME
 from vtbdrake.compiled.walker import InstantOutputs, Walker
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS
 from vtbdrake.components.compiled_plant.contact import FixedPiece
@@ -131,8 +132,8 @@ class CompiledRollouts:
         # One thread at a time: CasADi counts the references to its expressions without atomics.
         with making():
             self.walker = Walker(diagram, context.Clone(), variables, parameters)
-            self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
-            self._w = casadi.SX.sym("w", max(1, self.walker.noise))
+            self._z, self._time = casadi.SX.sym("z", self.walker.vector.size), casadi.SX.sym("time")
+            self._w = casadi.SX.sym("w", max(1, self.walker.draws.size))
             recorded, doubt = self._recorded_values()
             self.shapes = {
                 name: variables[name].shape if name in variables else (value.numel(),)
@@ -230,8 +231,8 @@ class CompiledRollouts:
         """Return the vector of state and parameters of a root context, shape (nz,)."""
         if context is self.walker.context:
             return self._z0.copy()
-        check_root(self.walker.diagram, context)
-        self.walker.check(context)
+        check_root(self.walker.systems.diagram, context)
+        self.walker.compiled_in.check_context(context)
         return self.walker.read(context)
 
     def filled(self, z: Array, values: Mapping[str, ArrayLike]) -> Array:
@@ -249,12 +250,12 @@ class CompiledRollouts:
         batch = np.repeat(z[np.newaxis], counts.pop() if counts else 1, axis=0)
         for address, array in arrays.items():
             batch[:, self.walker.place(address)] = array
-        self.walker.settle(z, batch, arrays)
+        self.walker.vector.settle(z, batch, arrays)
         return batch
 
     def _checked(self, address: str, value: ArrayLike) -> Array:
         """Return the values of a variable, of one rollout or of n, as an array of shape (1 or n, size)."""
-        variable = self.walker.variables[address]
+        variable = self.walker.systems.variables[address]
         array = as_array(address, value)
         many = array.ndim == len(variable.shape) + 1
         if array.shape[many:] != variable.shape:
@@ -276,8 +277,8 @@ class CompiledRollouts:
             z: State and parameters at the start, shape (n, nz).
             t0: The time at the start, in s.
         """
-        self.walker.check_fixed(z, self._z0)
-        z = self.walker.with_constants(z)
+        self.walker.compiled_in.check_vectors(z, self._z0)
+        z = self.walker.vector.with_constants(z)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
         chunks = [slice(k, k + program.most) for k in range(0, len(z), program.most)]
@@ -296,16 +297,17 @@ class CompiledRollouts:
             with ThreadPoolExecutor(self._workers) as pool:
                 list(pool.map(run, chunks))
         # A doubt stays, and a sample sees more than the updates: the first one tells.
-        doubted: NDArray[np.bool_] = ~(recorded[:, :, -1] <= 0.0)
+        doubted: NDArray[np.bool_] = ~(recorded[:, :, DOUBT] <= 0.0)
         first = recorded[np.arange(len(z)), doubted.argmax(axis=1)]
-        reasons = tuple(self.walker.reason(doubt, time) for time, doubt in first[:, -2:].tolist())
+        reasons = tuple(self.walker.reason(doubt, time) for time, doubt in first[:, DOUBT_TIME:].tolist())
         outputs = {
             name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self.shapes[name])
             for name, columns in self.columns.items()
         }
         valid: NDArray[np.bool_] = np.all(~doubted, axis=1)
-        ends, messages = final[:, -4], tuple(self.walker.message(*row[::-1]) for row in final[:, -4:-2].tolist())
-        has_ended = final[:, -3] > 0.0
+        ends = final[:, ENDING_TIME]
+        messages = tuple(self.walker.message(*row) for row in final[:, [ENDING, ENDING_TIME]].tolist())
+        has_ended = final[:, ENDING] > 0.0
         instants_of_samples = [instant.time for instant in instants if instant.is_sample]
         before = np.searchsorted(instants_of_samples, ends, side="right")
         counts = np.where(has_ended, before + 1, len(self.times))
@@ -368,7 +370,7 @@ class CompiledRollouts:
             instant: The instant.
         """
         values = self.record(z, instant.time, self._noise_at(z, instant)).full().ravel()
-        return {name: values[columns] for name, columns in self.columns.items()}, values[-1]
+        return {name: values[columns] for name, columns in self.columns.items()}, values[DOUBT]
 
     def read(self, address: str, context: Context) -> Any:
         """Return the value of an output in a root context.
@@ -377,7 +379,7 @@ class CompiledRollouts:
             address: Address of the output.
             context: A root context of the testbed.
         """
-        return self.walker.reader(address)(context)
+        return self.walker.systems.reader(address)(context)
 
     @property
     def function(self) -> casadi.Function:
@@ -400,10 +402,10 @@ class CompiledRollouts:
 
     def _refuse_initialization(self) -> None:
         probe = self.walker.context.Clone()
-        simulator = Simulator(self.walker.diagram, probe)
+        simulator = Simulator(self.walker.systems.diagram, probe)
         simulator.Initialize()
         z = self.walker.read(probe)
-        for block in self.walker.blocks.values():
+        for block in self.walker.vector.blocks.values():
             if not np.array_equal(z[block.entries], self._z0[block.entries], equal_nan=True):
                 raise UnsupportedTestbedError(
                     f"{block.path} is changed by an initialization event, which is not compiled: keep this testbed in "
@@ -428,7 +430,7 @@ class CompiledRollouts:
 
         ``before`` is the z before all updates of its kind, which are unrestricted or not.
         """
-        z = casadi.SX.sym("z", self.walker.size)
+        z = casadi.SX.sym("z", self.walker.vector.size)
         following = self.walker.update(timing, self._outputs_at_instant(), z)
         return casadi.Function(f"update_{number}", [self._z, z, self._time, self._w], [following], {"cse": True})
 
@@ -459,7 +461,7 @@ class CompiledRollouts:
 
     def _noise_at(self, z: Array, instant: Instant) -> Array:
         """Return the random numbers of one instant, shape (noise,)."""
-        w: Array = self.walker.draw_numbers(self.walker.seeds(z[np.newaxis]), [instant], 1)[0, 0]
+        w: Array = self.walker.draws.numbers(self.walker.draws.seeds(z[np.newaxis]), [instant], 1)[0, 0]
         return w
 
     def _planned(self, instants: list[Instant]) -> tuple[Program, Array]:
@@ -472,15 +474,15 @@ class CompiledRollouts:
 
     def _noise(self, z: Array, instants: Sequence[Instant], count: int) -> Array | None:
         """Return the random numbers of all rollouts and instants, shape (n, count, noise), or (1, ...) if all agree."""
-        if not self.walker.noise:
+        if not self.walker.draws.size:
             return None
-        seeds = self.walker.seeds(z)
+        seeds = self.walker.draws.seeds(z)
         if (seeds == seeds[0]).all():
             seeds = seeds[:1]
         key = seeds.tobytes(), instants[0].time, count
         last = self._last_noise
         if last[0] != key:
-            last = self._last_noise = key, self.walker.draw_numbers(seeds, instants, count)
+            last = self._last_noise = key, self.walker.draws.numbers(seeds, instants, count)
         return last[1]
 
 

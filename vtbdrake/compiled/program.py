@@ -12,6 +12,7 @@ import numpy as np
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.lru import LruDict
 from vtbdrake.compiled.schedule import Instant
+from vtbdrake.compiled.state_vector import ENDING, ENDING_TIME
 from vtbdrake.components.casadi_system.kernel import Buffers
 
 # Steps that are called one after the other before they become a function of their own.
@@ -114,7 +115,7 @@ def rollout_function(
     begin, instant, random = (
         casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 2 + len(updates)), ("w", w.numel()))
     )
-    state, has_ended = begin, begin[-3] > 0.0
+    state, has_ended = begin, begin[ENDING] > 0.0
     for kind in (True, False):
         before = state
         for k, update in enumerate(updates):
@@ -124,7 +125,7 @@ def rollout_function(
                 if_due = casadi.Function.if_else(f"due_{k}", update, keep)
                 is_due = casadi.if_else(has_ended, 0.0, instant[2 + k]) if may_end else instant[2 + k]
                 state = if_due(is_due, before, state, instant[0], random)
-    when = casadi.if_else(has_ended, begin[-4], instant[0]) if may_end else instant[0]
+    when = casadi.if_else(has_ended, begin[ENDING_TIME], instant[0]) if may_end else instant[0]
     recorded = sample(instant[1], begin, when, random)
     return _repeated(casadi.Function("step", [begin, instant, random], [state, recorded]), count)
 

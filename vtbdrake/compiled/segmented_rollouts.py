@@ -64,7 +64,7 @@ class SegmentedRollouts:
         samples = np.array(at_samples[1:]).reshape(-1, every)
         self._samples = samples - np.array(ends[:-1])[:, np.newaxis]
         self._first = [Instant(float(self.instants[0]), True, ())]
-        self._ahead = max(1, min(_MOST_AHEAD, _MOST_NUMBERS // (self._program.count * max(1, self._walker.noise))))
+        self._ahead = max(1, min(_MOST_AHEAD, _MOST_NUMBERS // (self._program.count * max(1, self._walker.draws.size))))
         # (seeds, number of the block of segments) -> random numbers, shape (segments, count, noise).
         self._drawn_blocks: dict[tuple[bytes, int], Array] = {}
 
@@ -77,8 +77,8 @@ class SegmentedRollouts:
         records = np.empty((len(z), self.record_size))
         plan = self._program.plan(self._first)
         noise = None
-        if self._walker.noise:
-            noise = self._walker.draw_numbers(self._walker.seeds(z), self._first, self._program.count)
+        if self._walker.draws.size:
+            noise = self._walker.draws.numbers(self._walker.draws.seeds(z), self._first, self._program.count)
         for chunk in self._chunks(len(z)):
             each = None if noise is None else noise[chunk]
             records[chunk] = self._program.run(z[chunk], each, plan)[1][:, 0]
@@ -117,9 +117,9 @@ class SegmentedRollouts:
 
         They are drawn for several segments ahead: one after the other, they would take longer than the rollouts.
         """
-        if not self._walker.noise:
+        if not self._walker.draws.size:
             return None
-        seeds = self._walker.seeds(z)
+        seeds = self._walker.draws.seeds(z)
         blocks, places = np.divmod(segments, self._ahead)
         keys = list(zip(map(np.ndarray.tobytes, seeds), blocks.tolist(), strict=True))
         missing: dict[int, dict[bytes, int]] = {}
@@ -142,5 +142,5 @@ class SegmentedRollouts:
         """
         count, parts = self._program.count, self._parts[number * self._ahead : (number + 1) * self._ahead]
         padded = [[*part, *[Instant(part[-1].time, False, ())] * (count - len(part))] for part in parts]
-        numbers = self._walker.draw_numbers(seeds, list(chain.from_iterable(padded)), count * len(parts))
+        numbers = self._walker.draws.numbers(seeds, list(chain.from_iterable(padded)), count * len(parts))
         return numbers.reshape(len(seeds), len(parts), count, -1)

@@ -13,6 +13,7 @@ from gymnasium.utils import seeding
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled import CompiledRollouts
 from vtbdrake.compiled.segmented_rollouts import SegmentedRollouts
+from vtbdrake.compiled.state_vector import DOUBT
 from vtbdrake.compiled.tracing import traced
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.environments.episodes import Episodes, FailedEpisodeError, seed_addresses
@@ -60,10 +61,10 @@ class CompiledVectorEnv(TestbedVectorEnv):
         self._segments = SegmentedRollouts(self._rollouts, self._times, every=episodes.every, t0=t0)
         self._seeds = seed_addresses(testbed.variables())
         # The seed of a sensor that is not compiled, because nothing depends on it, has no effect.
-        self._without_effect = frozenset(address for address in self._seeds if not walker.can_vary(address))
+        self._without_effect = frozenset(address for address in self._seeds if not walker.vector.can_vary(address))
         self._in_drake = _StepInDrake(testbed, self._rollouts, self._segments, episodes, self._actions)
         self._action_entries = np.concatenate(
-            [np.arange(walker.size)[walker.place(a)] for a in self._actions.addresses]
+            [np.arange(walker.vector.size)[walker.place(a)] for a in self._actions.addresses]
         )
         self._observed_entries = np.concatenate([self._entries(address) for address in self._observations.addresses])
         self._z0 = self._rollouts.z_of(s0)
@@ -248,7 +249,7 @@ class CompiledVectorEnv(TestbedVectorEnv):
 
     def _departed(self, records: Array) -> list[int]:
         """Return the rows of records of shape (n, m, ny) that are not Drake's, or in which a measure is not valid."""
-        departed = ~(records[:, :, -1] <= 0.0).all(axis=1)
+        departed = ~(records[:, :, DOUBT] <= 0.0).all(axis=1)
         for k, measure in enumerate(self.episodes.measures):
             if (name := _measure_name(k)) in self._rollouts.columns:
                 departed |= ~measure.accepts(records[:, :, self._entries(name)[0]]).all(axis=1)

@@ -58,10 +58,10 @@ def native_model(part: ExportedPart, step: float) -> str:
 
 
 def _refuse_draws(rollouts: CompiledRollouts) -> None:
-    draws = rollouts.walker.draws
+    draws = list(rollouts.walker.draws.placed.values())
     if draws:
         raise UnsupportedTestbedError(
-            f"{draws[0][0]} draws random numbers, or reads samples of a recording, which no native FMU has: set its "
+            f"{draws[0].path} draws random numbers, or reads samples of a recording, which no native FMU has: set its "
             "errors to 0"
         )
 
@@ -82,10 +82,10 @@ def _functions(rollouts: CompiledRollouts) -> str:
 def _tables(part: ExportedPart, rollouts: CompiledRollouts) -> str:
     """Return the definitions that `native.c` needs."""
     walker, functions = rollouts.walker, [*rollouts.updates, rollouts.record]
-    places = [i for v in part.settable for i in range(*walker.place(v.address).indices(walker.size))]
+    places = [i for v in part.settable for i in range(*walker.place(v.address).indices(walker.vector.size))]
     timings = ", ".join(f"{{{number(t.period)}, {number(t.offset)}, {int(t.unrestricted)}}}" for t in walker.timings)
     numbers = {
-        "NZ": walker.size,
+        "NZ": walker.vector.size,
         "NW": functions[-1].numel_in(2),
         "N_TIMINGS": len(walker.timings),
         "N_ARGUMENTS": max(function.sz_arg() for function in functions),

@@ -273,7 +273,7 @@ class _CompiledTask:
         )
         self._start_context = StartContext(testbed, s0, testbed.copier_from(testbed))
         self._z0 = self._rollouts.z_of(s0)
-        self._into, self._from = self._rollouts.walker.shared_with(testbed.start_layout)
+        self._into, self._from = self._rollouts.walker.vector.shared_with(testbed.start_layout)
         self._duration = inf  # Duration of a rollout of the last batch, in seconds.
         self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
@@ -294,7 +294,7 @@ class _CompiledTask:
         """Return whether variables can be varied without compiling again."""
         if addresses not in self._varies:
             self._varies[addresses] = all(
-                self._rollouts.walker.can_vary(address) for address in addresses - self._by_start
+                self._rollouts.walker.vector.can_vary(address) for address in addresses - self._by_start
             )
         return self._varies[addresses]
 
@@ -342,7 +342,7 @@ class _CompiledTask:
         rows = []
         for row, of_row in zip(z, values, strict=True):
             walker.write(row, context)
-            walker.variables.write(context, of_row)
+            walker.systems.variables.write(context, of_row)
             rows.append(walker.read(context))
         return np.array(rows)
 
@@ -362,7 +362,7 @@ class _CompiledTask:
         walker = self._rollouts.walker
         is_compiled = start is not None and self._is_compiled(start)
         # Other variables change more than their own value: a mass scales an inertia.
-        if start is not None and is_compiled and all(walker.variables[a].place for a in start.values):
+        if start is not None and is_compiled and all(walker.systems.variables[a].place for a in start.values):
             z = self._z0.copy()
             z[self._into] = start.contents.numbers[self._from]
             return self._rollouts.filled(z, start.values)[0], start.time
