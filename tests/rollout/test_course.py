@@ -54,6 +54,23 @@ def test_driven_rollout_is_a_simulation_with_the_same_writes() -> None:
     assert result.h == max(result.quality)
 
 
+def _small(theta: float) -> float:
+    if abs(theta) > 0.2:
+        raise RuntimeError("too large")
+    return abs(theta)
+
+
+def test_failing_quality_ends_a_driven_rollout() -> None:
+    stated = RolloutTask(HELD, horizon=1.0, quality=Quality(_small, of=ANGLE), sample_period=0.1)
+    rollout = driven(stated, {}, 3)
+    while rollout.result is None and rollout.steps < 30:
+        rollout.advance({"u.angle": 1.0})
+    assert rollout.result is not None
+    assert rollout.result.end == "failed" and isnan(rollout.result.h)
+    assert "raises RuntimeError: too large" in rollout.result.message
+    assert rollout.course.rollout(stated).identical(rollout.result)
+
+
 def test_course_without_writes_is_the_rollout_of_the_task() -> None:
     stated = RolloutTask(
         DoublePendulumScenario(),

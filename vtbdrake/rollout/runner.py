@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -123,9 +123,8 @@ class RolloutRunner:
             interruptible.raise_interrupt()
 
         samples = _Samples(self, cutoff.to_beat)
-        end, message = HORIZON, ""
         with Interruptible() as interruptible:
-            try:
+            with samples.failures_as_ends():
                 recording = self._recording(parameters, raise_if_cancelled)
                 self._reset(parameters)
                 for index, (t, instant) in enumerate(zip(self._times.tolist(), self._instants.tolist(), strict=True)):
@@ -134,24 +133,13 @@ class RolloutRunner:
                     status = self._advance(t, instant)
                     if self._player is not None and index < len(recording.worlds):
                         self._player.compare(self._context, recording.worlds[index])
-                    terminated = _terminated(status)
-                    reached = self._context.get_time() - self._t0 if terminated else t
-                    if samples.add(reached) and not self.task.run_on:
+                    if samples.take(t, status):
                         break
-                    if terminated:
-                        end, message = TERMINATED, status.FormatMessage()
-                        break
-                    if samples.ending:
-                        end, message = samples.ending
+                    if samples.pruned:
+                        samples.end, samples.message = samples.pruned
                         break
                 samples.refuse_overflow()
-            except SimulationError as failure:
-                end, message = FAILED, str(failure)
-            except QualityError as failure:
-                if not self.task.catch:
-                    raise
-                end, message = FAILED, f"{QUALITY_FAILED}{failure}"
-            return samples.result(dict(parameters), end, message, started)
+            return samples.result(dict(parameters), started)
 
     def drive(self, step: float) -> Generator[float, bool | None, RolloutResult]:
         """Run one rollout from s0 whose variables somebody sets while it runs.
@@ -173,28 +161,22 @@ class RolloutRunner:
         """
         started = time.perf_counter()
         self._set_start(None)
-        samples, end, message = _Samples(self, Cutoff().to_beat), HORIZON, ""
-        try:
+        samples = _Samples(self, Cutoff().to_beat)
+        with samples.failures_as_ends():
             self._reset({})
             for t, sampled, paused, instant in self._with_pauses(step):
                 if t == 0.0 and (yield t):
-                    end, message = TERMINATED, BY_HAND
+                    samples.end, samples.message = TERMINATED, BY_HAND
                 status = self._advance(t, instant)
-                terminated = _terminated(status)
-                reached = self._context.get_time() - self._t0 if terminated else t
-                if (sampled or terminated) and samples.add(reached) and not self.task.run_on:
+                if (sampled or _terminated(status)) and samples.take(t, status):
                     break
-                if terminated:
-                    end, message = TERMINATED, status.FormatMessage()
-                if end == TERMINATED:
+                if samples.end == TERMINATED:
                     break
                 if paused and t > 0.0 and t < self._times[-1] and (yield t):
-                    end, message = TERMINATED, BY_HAND
+                    samples.end, samples.message = TERMINATED, BY_HAND
                     break
             samples.refuse_overflow()
-        except SimulationError as failure:
-            end, message = FAILED, str(failure)
-        return samples.result({}, end, message, started)
+        return samples.result({}, started)
 
     def _with_pauses(self, step: float) -> Iterator[tuple[float, bool, bool, float]]:
         """Yield the sample times and the multiples of ``step``.
@@ -453,7 +435,13 @@ _failures_as_outcomes = _FailuresAsOutcomes()
 
 
 class _Samples:
-    """The samples of the present rollout."""
+    """The samples of the present rollout, and how it ends.
+
+    Attributes:
+        end: Why the rollout ends, see `RolloutResult`.
+        message: The same in a sentence; empty at the horizon and beyond the threshold.
+        pruned: Why it should end early, in a word and in a sentence, see `Prospect`.
+    """
 
     def __init__(self, runner: RolloutRunner, to_beat: float) -> None:
         self._runner = runner
@@ -461,14 +449,36 @@ class _Samples:
         self._prospect: Prospect | None = None
         if task.pruning is not None and task.quality is not None:
             self._prospect = Prospect(task.pruning, task.quality, task.measures, task.horizon, to_beat)
-        # Why the rollout ends early, in a word and in a sentence.
-        self.ending: tuple[str, str] | None = None
+        self.end, self.message = HORIZON, ""
+        self.pruned: tuple[str, str] | None = None
         self._times: list[float] = []
         self._clock = np.nan
         self._samples: list[list[float]] = [[] for _ in runner._measures]
         self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
 
-    def add(self, t: float) -> bool:
+    @contextmanager
+    def failures_as_ends(self) -> Iterator[None]:
+        """Let the rollout end where its simulation fails, or a function that the task catches."""
+        try:
+            yield
+        except SimulationError as failure:
+            self.end, self.message = FAILED, str(failure)
+        except QualityError as failure:
+            if not self._runner.task.catch:
+                raise
+            self.end, self.message = FAILED, f"{QUALITY_FAILED}{failure}"
+
+    def take(self, t: float, status: SimulatorStatus) -> bool:
+        """Sample the state at t, or where a system has ended the simulation; return whether the rollout is over."""
+        runner, terminated = self._runner, _terminated(status)
+        is_beyond = self._add(runner.context.get_time() - runner._t0 if terminated else t)
+        if is_beyond and not runner.task.run_on:
+            return True
+        if terminated:
+            self.end, self.message = TERMINATED, status.FormatMessage()
+        return terminated
+
+    def _add(self, t: float) -> bool:
         """Sample f, the measures and the records; return whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
         with _failures_as_outcomes:
@@ -483,7 +493,7 @@ class _Samples:
         if self._prospect is not None:
             with _failures_as_outcomes:
                 values = [read(runner._context) for read in runner._bound_readers]
-            self.ending = self._prospect.update(t, new, values)
+            self.pruned = self._prospect.update(t, new, values)
         if task.quality is None or task.threshold is None:
             return False
         return bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
@@ -504,7 +514,7 @@ class _Samples:
                     f"sample is {max(map(abs, samples)):g}: state it in a larger unit"
                 )
 
-    def result(self, parameters: dict[str, Any], end: str, message: str, started: float) -> RolloutResult:
+    def result(self, parameters: dict[str, Any], started: float) -> RolloutResult:
         task = self._runner.task
         result = _result_of_samples(
             task,
@@ -512,8 +522,8 @@ class _Samples:
             np.array(self._times),
             [np.array(samples) for samples in self._samples],
             {address: stacked(values) for address, values in self._record.items()},
-            end=end,
-            message=message,
+            end=self.end,
+            message=self.message,
             reachable=None if self._prospect is None else self._prospect.reachable,
             wall_time=time.perf_counter() - started,
         )
