@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -258,12 +259,10 @@ class RolloutRunner:
             raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
         try:
             with Interruptible() as interruptible:
-                self._reset(parameters)
-                for time_, instant in zip(self._times[: last + 1], self._instants[: last + 1], strict=True):
+                for _ in islice(self.simulate(parameters, start=start), last + 1):
                     interruptible.raise_interrupt()
-                    status = self._advance(time_, instant)
-                    if _terminated(status) and self._context.get_time() < self._instants[last]:
-                        raise SimulationError(status.FormatMessage())
+                if self._context.get_time() < self._instants[last]:
+                    raise SimulationError(self.termination)
         except SimulationError as failure:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
         return self.testbed.snapshot(self._context)
