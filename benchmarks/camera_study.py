@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.measure import HIGHER, Benchmark, interleaved_values, spread
 from vtbdrake.rollout import RolloutResult, RolloutRunner
-from vtbdrake_diagrams.satellite.studies.mount import BY_HAND, FOUND_ON, mount_problem
+from vtbdrake_diagrams.satellite.studies.mount_placements import BY_HAND, FOUND_ON, mount_problem
 
 CANDIDATES = 50
 

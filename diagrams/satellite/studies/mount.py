@@ -4,7 +4,7 @@ The capture is led by a pose sensor, and the camera looks on: so the motion does
 recorded once for every capture (`vtbdrake.RecordedMotion`). The camera sits at the front face of the base, on which the
 arm stands, too. All six numbers of its pose are decided.
 
-The choices that influence the answer were fixed before the first placement was judged:
+The choices that influence the answer (here and in `mount_placements`) were fixed before the first placement was judged:
 
 * the captures: placements are found on `FOUND_ON`, and judged on `JUDGED_ON`, each at five tumble rates;
 * the placements by hand: the places `PLACES`, each aimed by the rules `RULES`. One rule knows how the base reacts to
@@ -43,41 +43,29 @@ from scipy.stats import t as student
 
 import vtbdrake as vtb
 from vtbdrake.common.arrays import Array
-from vtbdrake.components.perception.markers import detect_markers, pose_from_markers
-from vtbdrake.rollout import RolloutResult, RolloutRunner
-from vtbdrake.state import NamedVector, Quantity
-from vtbdrake.state.systems import pose_from_array, pose_later, pose_to_array
+from vtbdrake.state.systems import pose_from_array
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake.visualization.study_plots import BEST
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.kept_results import Repetition, read_results, repeat, write_results
-from vtbdrake_diagrams.satellite.bodies import Servicer, Target
-from vtbdrake_diagrams.satellite.perception import target_board
-from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
-from vtbdrake_diagrams.satellite.start import random_start
-from vtbdrake_diagrams.satellite.studies.grips import FAILURE, guided_grips
-
-POSE = "sim.sense.docking_camera.pose"
-_ENTRIES = NamedVector(
-    x=Quantity(unit="m"),
-    y=Quantity(unit="m"),
-    z=Quantity(unit="m"),
-    roll=Quantity(unit="rad"),
-    pitch=Quantity(unit="rad"),
-    yaw=Quantity(unit="rad"),
+from vtbdrake_diagrams.satellite.bodies import Servicer
+from vtbdrake_diagrams.satellite.studies.mount_looks import IMAGE, Guided, Look, Onlooker, guide
+from vtbdrake_diagrams.satellite.studies.mount_placements import (
+    ENTRIES,
+    FOOT_DISTANCE,
+    FOUND_ON,
+    JUDGED_ON,
+    LONG_JUDGED_ON,
+    REACH,
+    RULES,
+    SAMPLE_PERIOD,
+    STILL,
+    TUMBLES,
+    Capture,
+    by_hand,
+    distance_from_foot,
 )
-IMAGE = "sim.sense.docking_camera.color_image"
-COUNT = "dps.env.markers.count"
-_EXPOSURE = "sim.sense.docking_camera.exposure"
-_BODIES = ("sim.sys.servicer.base", "sim.sys.target.body")
-_MOTION = tuple(f"{body}.{value}" for body in _BODIES for value in ("pose", "velocity"))
 
-HORIZON = 24.0
-"""How long the markers count, in s: from the start until the relative motion has stopped."""
-SAMPLE_PERIOD = 4.0
-"""How often they are counted, in s."""
-TUMBLES = (0.5, 1.0, 1.5, 2.0, 3.0)
-"""The tumble rates of the captures, in deg/s: up to the one at which captures must succeed."""
 TELLING = 0.3
 """The least difference of mean counts that means anything, in markers."""
 GLOBAL = 10
@@ -86,10 +74,6 @@ LOCAL = 14
 """The number of placements that COBYLA tries after them."""
 GUIDED = 5
 """The number of captures of `JUDGED_ON` that the cameras guide."""
-GUIDED_HORIZON = 36.0
-"""How long a capture that the camera guides may take, in s."""
-GUIDED_RATE = 2.5
-"""The images per second of a camera that guides, in Hz: less than usual, because images are what a capture costs."""
 LONG_GLOBAL = 40
 """The number of placements that the default solver tries in the long search."""
 LONG_LOCAL = 40
@@ -100,298 +84,6 @@ LONG_RESULTS = Path(__file__).with_name("mount_search.json")
 """The results that ``--search`` keeps."""
 LONG_COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --search"
 COMMAND = "python -m vtbdrake_diagrams.satellite.studies.mount --full"
-
-# The least place of the camera along x of B, in m: 2 cm before the front face; a bracket reaches 10 cm farther.
-_X = 0.62
-_BRACKET = 0.1
-# Largest distance from the middle of the face at which the camera's housing fits on it, in m.
-_REACH = 0.45
-# How far the view may turn away from straight ahead, and about its axis, in rad.
-_TURN = 0.8
-_TWIST = 1.2
-# How far the camera stays away from the axis of the arm's foot, in m.
-_FOOT = 0.18
-# How far the base turns down while the arm reaches out, in rad: 17 to 20 deg.
-_REACTION = 0.33
-
-
-@dataclass(frozen=True)
-class Capture:
-    """A capture: its start and its tumble rate.
-
-    Attributes:
-        seed: The seed of the start.
-        tumble_deg: The tumble rate in deg/s.
-    """
-
-    seed: int
-    tumble_deg: float = SatelliteScenario.tumble_deg
-
-    def values(self) -> dict[str, Any]:
-        """Return the values that make a rollout start as in a scenario with this seed and rate."""
-        start = random_start(self.seed, tumble=np.radians(self.tumble_deg), distance=SatelliteScenario.distance)
-        return start.values()
-
-
-def captures(first: int, count: int) -> tuple[Capture, ...]:
-    """Return captures with the seeds from ``first`` on, at all rates of `TUMBLES` in turn."""
-    return tuple(Capture(first + k, TUMBLES[k % len(TUMBLES)]) for k in range(count))
-
-
-FOUND_ON = captures(0, 5)
-"""The captures on which placements are found."""
-JUDGED_ON = captures(100, 20)
-"""The captures on which they are judged."""
-LONG_JUDGED_ON = captures(200, 20)
-"""The captures on which the long search is judged; nothing else was judged on them."""
-
-
-def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
-    """Return [x, y, z, roll, pitch, yaw] of the camera in B, on the front face.
-
-    Args:
-        y: To the left, in m.
-        z: Up, in m.
-        tilt: How far it looks down, in rad.
-        pan: How far it looks to the left, in rad.
-    """
-    return _ENTRIES.array(x=_X, y=y, z=z, roll=-np.pi / 2 - tilt, yaw=-np.pi / 2 + pan)
-
-
-def aimed(y: float, z: float, p_BQ: Array | None = None) -> Array:
-    """Return the pose of a camera on the front face that looks at a point.
-
-    Args:
-        y: Place of the camera to the left, in m.
-        z: Its place up, in m.
-        p_BQ: The point in B, in m; by default the place where the bar is gripped, as if the base stood still.
-    """
-    if p_BQ is None:
-        p_BQ = np.array([SatelliteScenario.distance, 0.0, 0.0]) + Target().X_TH.translation()
-    ahead, left, up = p_BQ - [_X, y, z]
-    return pose(y, z, tilt=float(np.arctan2(-up, np.hypot(ahead, left))), pan=float(np.arctan2(left, ahead)))
-
-
-PLACES: dict[str, tuple[float, float]] = {
-    "above the arm": Servicer().camera_position[1:],
-    "on the left": (0.4, 0.0),
-    "on the right": (-0.4, 0.0),
-    "in the upper left corner": (0.4, 0.4),
-    "beside the foot of the arm": (0.25, -0.35),
-}
-"""The places by hand: y and z in B, in m."""
-
-BY_HAND: dict[str, Array] = {
-    name: pose_to_array(Servicer().X_BC) if name == "above the arm" else aimed(*place) for name, place in PLACES.items()
-}
-"""The placements by hand as if the base stood still."""
-
-STILL = "as if the base stood still"
-TURNED = "turned up by the turn of the base"
-RULES = (STILL, TURNED)
-"""How placements by hand are aimed. `TURNED` knows how the base reacts to the arm."""
-
-
-def by_hand(rule: str) -> dict[str, Array]:
-    """Return the placements by hand that a rule of `RULES` aims."""
-    turn = _REACTION if rule == TURNED else 0.0
-    return {name: value + _ENTRIES.array(roll=turn) for name, value in BY_HAND.items()}
-
-
-def _address(name: str) -> str:
-    """Return the address of an entry of the pose."""
-    return f"{POSE}[{_ENTRIES.slice_of(name).start}]"
-
-
-PARAMETERS = (
-    vtb.Parameter(_address("x"), _X, _X + _BRACKET),
-    vtb.Parameter(_address("y"), -_REACH, _REACH),
-    vtb.Parameter(_address("z"), -_REACH, _REACH),
-    vtb.Parameter(_address("roll"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
-    vtb.Parameter(_address("pitch"), -_TWIST, _TWIST),
-    vtb.Parameter(_address("yaw"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
-)
-
-
-def markers_seen(count: float) -> float:
-    """Return f: the number of markers that the DPS has detected in the last image."""
-    return count
-
-
-def distance_from_foot(value: Array) -> float:
-    """Return how far a camera with this pose is from the axis of the arm's foot, in m."""
-    _, y, z = Servicer().shoulder
-    camera = _ENTRIES.view(value)
-    return float(np.hypot(camera.y - y, camera.z - z))
-
-
-def scenario() -> SatelliteScenario:
-    """Return the scenario: a capture that the pose sensor leads, while the docking camera looks on."""
-    return SatelliteScenario(perception="pose_sensor", onlookers="camera")
-
-
-def mount_problem(
-    parameters: Sequence[vtb.Parameter] = PARAMETERS,
-    *,
-    on: Sequence[Capture] = FOUND_ON,
-    reading: str = "integral",
-    fixed: Mapping[str, float] | None = None,
-    recorded: bool = True,
-) -> vtb.Problem:
-    """State the question in the paper's five steps.
-
-    Args:
-        parameters: Entries of the camera's pose.
-        on: The captures over which the quality is averaged.
-        reading: The quality of the number of markers over time: ``integral``, in markers times s, or ``best``, the
-            paper's maximum.
-        fixed: Values of other entries of the pose, by address.
-        recorded: Whether candidates are judged along recorded motions.
-    """
-    capture_scenario = scenario()
-    upper = float(len(Target().tags))
-    # The count that f reads is of an image that is at most a period of the camera old.
-    memory = 1.0 / capture_scenario.camera_fps + 0.02
-    return vtb.Problem(
-        scenario=capture_scenario,
-        parameters=list(parameters),
-        quality=vtb.Quality(markers_seen, of=COUNT, reading=reading, upper=upper),
-        horizon=HORIZON,
-        sample_period=SAMPLE_PERIOD,
-        conditions=[{**capture.values(), **(fixed or {})} for capture in on],
-        risk="mean",
-        constraints=[vtb.Constraint(distance_from_foot, of=POSE, at_least=_FOOT)],
-        motion=vtb.RecordedMotion(memory, while_recording={_EXPOSURE: 0.0}) if recorded else None,
-    )
-
-
-# -- looking on
-
-
-@dataclass(frozen=True)
-class Look:
-    """What a camera sees in some captures.
-
-    Attributes:
-        counts: The markers at the sample times after the start, shape (captures, samples).
-        errors: How far the pose from an image's markers has the bar off, in m, likewise; NaN where there is no pose.
-    """
-
-    counts: Array
-    errors: Array
-
-    @property
-    def means(self) -> Array:
-        """Return the mean number of markers over each capture, by the trapezoidal rule, shape (captures,)."""
-        from_start = np.concatenate([np.zeros_like(self.counts[:, :1]), self.counts], axis=1)
-        means: Array = np.trapezoid(from_start, dx=SAMPLE_PERIOD, axis=1) / HORIZON
-        return means
-
-    @property
-    def mean(self) -> float:
-        """Return the mean number of markers."""
-        return float(self.means.mean())
-
-    @property
-    def most(self) -> float:
-        """Return the mean over the captures of the maximum over time, the paper's quality."""
-        return float(self.counts.max(axis=1).mean())
-
-    @property
-    def posed(self) -> float:
-        """Return the share of the images that give a pose."""
-        return float(np.isfinite(self.errors).mean())
-
-    @property
-    def accuracy(self) -> float:
-        """Return the median error of the bar over the images that give a pose, in m; NaN if none does."""
-        return float(np.nanmedian(self.errors)) if self.posed else float("nan")
-
-    @staticmethod
-    def of(stored: Mapping[str, Any]) -> Look:
-        """Return what was kept."""
-        return Look(np.array(stored["counts"], dtype=float), np.array(stored["errors"], dtype=float))
-
-
-class Onlooker:
-    """Judges placements along recorded captures, one capture and placement at a time.
-
-    Args:
-        on: The captures.
-    """
-
-    def __init__(self, on: Sequence[Capture]) -> None:
-        self.problem = mount_problem(on=on)
-        self._count = len(on)
-        task = replace(self.problem.task, record=(IMAGE, *_MOTION), catch=False)
-        self._runner = RolloutRunner(task, self.problem.testbed)
-        info = self.problem.scenario.camera_info  # type: ignore[attr-defined]
-        self._intrinsics = np.array([info.focal_x(), info.focal_y(), info.center_x(), info.center_y()])
-        self._board = target_board()
-
-    def rollout(self, value: Array, capture: int = 0) -> RolloutResult:
-        """Return the rollout with a placement in a capture, with its images and the motion."""
-        rollout = self._runner.run(self.problem.values(value.tolist(), condition=capture))
-        if rollout.failed:
-            raise ValueError(f"the camera at {value.tolist()} cannot be judged: {rollout.message}")
-        return rollout
-
-    def look(self, value: Array) -> Look:
-        """Return what a camera with this pose sees in all captures."""
-        rollouts = [self.rollout(value, k) for k in range(self._count)]
-        return Look(
-            np.array([rollout.quality[1:] for rollout in rollouts]),
-            np.array([self._errors(rollout, value) for rollout in rollouts]),
-        )
-
-    def _errors(self, rollout: RolloutResult, value: Array) -> list[float]:
-        """Return the error of the bar by each image after the start, in m."""
-        X_BC, p_THo = pose_from_array(value), Target().X_TH.translation()
-        age = -1.0 / self.problem.scenario.camera_fps  # type: ignore[attr-defined]
-        errors = []
-        for k in range(1, len(rollout.times)):
-            X_WB, X_WT = (
-                pose_from_array(
-                    pose_later(rollout.record[f"{body}.pose"][k], rollout.record[f"{body}.velocity"][k], age)
-                )
-                for body in _BODIES
-            )
-            X_CT = (X_WB @ X_BC).InvertAndCompose(X_WT)
-            detections = detect_markers(rollout.record[IMAGE][k]).on(self._board)
-            # The tracker's prediction, which decides between two poses of markers in a plane, is near the truth.
-            estimate = pose_from_markers(detections, self._board, self._intrinsics, time=0.0, prediction=X_CT)
-            errors.append(float(np.linalg.norm(estimate.X @ p_THo - X_CT @ p_THo)) if estimate.valid else np.nan)
-        return errors
-
-
-# -- guiding
-
-
-@dataclass(frozen=True)
-class Guided:
-    """The captures that a camera has guided.
-
-    Attributes:
-        times: When the fingers held the bar, in s, `FAILURE` if they never did, shape (captures,).
-        errors: How far the bar was from where the DPS believed it then, in m; NaN without success.
-    """
-
-    times: Array
-    errors: Array
-
-    @property
-    def successes(self) -> int:
-        """Return how many captures succeeded."""
-        return int((self.times < FAILURE).sum())
-
-
-def guide(value: Array, on: Sequence[Capture]) -> Guided:
-    """Simulate captures that a camera with this pose guides, alone and without wheels."""
-    guided = SatelliteScenario(perception="camera", camera_fps=GUIDED_RATE, camera_pose=value.tolist())
-    return Guided(*guided_grips(guided, [capture.values() for capture in on], horizon=GUIDED_HORIZON))
-
-
-# -- the campaign
 
 
 @dataclass(frozen=True, eq=False)
@@ -610,13 +302,13 @@ def position_slice(look: Callable[[Array], Look], best: Array, points: int = 4) 
         best: The best pose.
         points: The number of points per side.
     """
-    axis = np.linspace(-_REACH, _REACH, points)
+    axis = np.linspace(-REACH, REACH, points)
     mean, most = np.full((2, points, points), np.nan)
     for i, y in enumerate(axis):
         for k, z in enumerate(axis):
             value = best.copy()
             value[1:3] = y, z
-            if distance_from_foot(value) >= _FOOT:
+            if distance_from_foot(value) >= FOOT_DISTANCE:
                 seen_there = look(value)
                 mean[i, k], most[i, k] = seen_there.mean, seen_there.most
     return {"y": axis, "z": axis, "mean": mean, "most": most}
@@ -749,7 +441,7 @@ def _draw_slice(axes: Axes, answer: MountAnswer, key: str, title: str) -> None:
     for k, placement in enumerate(placement for placement in answer.judged if placement.rule != SEARCH):
         axes.plot(*placement.pose[1:3], "o", color=f"C{k}", mec="white")
     mark_best(axes, *answer.best.pose[1:3])
-    axes.add_patch(Circle(Servicer().shoulder[1:], _FOOT, fill=False, color="white", ls=":"))
+    axes.add_patch(Circle(Servicer().shoulder[1:], FOOT_DISTANCE, fill=False, color="white", ls=":"))
     axes.set(xlabel="y in B [m]", ylabel="z in B [m]", title=title)
 
 
@@ -791,7 +483,7 @@ def _words(placement: Placement) -> str:
 
 def _place(value: Array) -> str:
     """Return where a camera with this pose is, and where it looks."""
-    camera = _ENTRIES.view(value)
+    camera = ENTRIES.view(value)
     ahead, left, up = pose_from_array(value).rotation().matrix()[:, 2]
     side = "left" if left >= 0.0 else "right"
     return (

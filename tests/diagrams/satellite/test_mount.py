@@ -16,6 +16,15 @@ from vtbdrake_diagrams.kept_results import read_results, write_results
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.studies.mount import (
+    SEARCH,
+    LongSearch,
+    MountAnswer,
+    Placement,
+    judged_placements,
+    search_mount,
+)
+from vtbdrake_diagrams.satellite.studies.mount_looks import Guided, Look, Onlooker
+from vtbdrake_diagrams.satellite.studies.mount_placements import (
     BY_HAND,
     COUNT,
     FOUND_ON,
@@ -26,23 +35,14 @@ from vtbdrake_diagrams.satellite.studies.mount import (
     POSE,
     RULES,
     SAMPLE_PERIOD,
-    SEARCH,
     STILL,
     TUMBLES,
     TURNED,
-    Guided,
-    LongSearch,
-    Look,
-    MountAnswer,
-    Onlooker,
-    Placement,
     by_hand,
     distance_from_foot,
-    judged_placements,
     mount_problem,
     pose,
     scenario,
-    search_mount,
 )
 
 # The bar in B when the target faces the servicer, as in the scenario.
@@ -140,7 +140,7 @@ def test_poses_from_images_are_right_to_millimetres(monkeypatch):
         check_rendering()
     except RenderingError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr("vtbdrake_diagrams.satellite.studies.mount.HORIZON", SAMPLE_PERIOD)
+    monkeypatch.setattr("vtbdrake_diagrams.satellite.studies.mount_placements.HORIZON", SAMPLE_PERIOD)
     look = Onlooker(FOUND_ON[1:2]).look(BY_HAND["on the right"])
     assert look.counts.shape == look.errors.shape == (1, 1)
     assert look.counts[0, 0] >= 4.0
