@@ -16,16 +16,8 @@ from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies import fusion, on_foot, revised_maps, trees_and_rocks
-from vtbdrake_diagrams.forest.studies.drives import (
-    GOALS,
-    REACH,
-    SEED,
-    BestError,
-    Drives,
-    Score,
-    against_best,
-    scores,
-)
+from vtbdrake_diagrams.forest.studies.best_estimate import REACH, BestError, against_best
+from vtbdrake_diagrams.forest.studies.drives import GOALS, SEED, Drives, Score, scores
 
 CYCLES = 150
 """The number of cycles of the loop in lock-step with the process that sends the sensors' data."""

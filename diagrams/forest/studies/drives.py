@@ -19,49 +19,27 @@ The criteria, fixed before any of the forests from `SEED` on was driven:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Self, TypeVar
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import click
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.systems.framework import Context
-from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
-from vtbdrake.common.arrays import Array, rms
-from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
-from vtbdrake.components.localization.planar import wrap
-from vtbdrake.components.localization.unit import LOST, TRACKING, Localization, LocalizationUnit, UnitState, Views
-from vtbdrake.testbed import VirtualTestbed
-from vtbdrake_diagrams.forest.dps import PERIOD
-from vtbdrake_diagrams.forest.perception import LandmarkSensor
+from vtbdrake.common.arrays import rms
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
-from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
-from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.studies.best_estimate import REACH, against_best
+from vtbdrake_diagrams.forest.studies.detections import Detector
+from vtbdrake_diagrams.forest.studies.drive import Track, localize, recorded_drive, simulated_drive
+from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.plain.scenario import PlainScenario
 from vtbdrake_diagrams.processes import in_processes
 
-INDEPENDENT = 100.0
-"""Estimates count as independent if they are at least this far apart along the path, in m."""
-REACH = 20.0
-"""Trees within this distance of the path count as seen, in m; see `best_estimates`. Assumed."""
 LATE = 10.0
 """The time in s after which errors of the vertical do not belong to the start any more."""
-NOISE = 0.02
-"""Standard deviation in m, per axis, of a tree's position relative to the carrier; see `best_estimates`. Assumed."""
-_DRAWS = 4000  # of forests, for an interval
-STANDING = 2.0
-"""The time in s for which the carrier stands before it drives: the gyros show their bias, and the attitude settles."""
-_SPEED = "sim.act.driver.speed"
-_POSE = "sim.sys.carrier.base.pose"
-_ARRIVAL = "dps.env.{signal}_arrival"
-_HISTORY = "dps.env.dead_reckoning.history"
 
-SCANS = 5.0
-"""The number of scans per second."""
 DENSITIES = (605.0, 1210.0)
 """The numbers of trees per hectare of the plots that `stand` cites, before roads are cleared."""
 ABUNDANCES = (0.03, 0.1)
@@ -79,227 +57,6 @@ SEED = 600_000
 Forests from 200,000 and from 500,000 on were driven before, and do not count any more: the duration of the errors of
 the vertical was not considered in the first ones, and the noise of the sensors was the same in all.
 """
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """The inputs of a unit along a drive, and the true poses.
-
-    Attributes:
-        times: The times of the scans in s, shape (n,).
-        truth: The true poses X_WH, shape (n, 3).
-        reckoned: The poses X_OH by dead reckoning, shape (n, 3).
-        landmarks: The detections of each scan, in H, or what several sensors see at that time; n of them.
-        tilts: Errors of roll and pitch by the dead reckoning in rad, shape (n, 2); (0, 2) for a simulated drive.
-    """
-
-    times: Array
-    truth: Array
-    reckoned: Array
-    landmarks: tuple[Views, ...]
-    tilts: Array = field(default_factory=lambda: np.zeros((0, 2)))
-
-    @property
-    def travelled(self) -> Array:
-        """The distance travelled at each scan, in m, shape (n,)."""
-        return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.truth[:, :2], axis=0).T))])
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """The answers of a unit along a drive.
-
-    Attributes:
-        drive: The drive.
-        poses: The poses X_WH, shape (n, 3); NaN without a pose.
-        covariances: The covariances of the poses, shape (n, 3, 3).
-        status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`, shape (n,).
-    """
-
-    drive: Drive
-    poses: Array
-    covariances: Array
-    status: NDArray[np.int_]
-
-    @property
-    def is_localized(self) -> NDArray[np.bool_]:
-        """Return whether the unit claims a pose, shape (n,)."""
-        return self.status == TRACKING
-
-    @property
-    def errors(self) -> Array:
-        """Errors [x, y, heading] in m and rad where a pose is claimed, shape (m, 3)."""
-        errors = (self.poses - self.drive.truth)[self.is_localized]
-        errors[:, 2] = [wrap(angle) for angle in errors[:, 2]]
-        return errors
-
-    @property
-    def nees(self) -> Array:
-        """Normalized estimation error squared where a pose is claimed, shape (m,)."""
-        errors = self.errors
-        inverses = np.linalg.inv(self.covariances[self.is_localized])
-        return np.einsum("ni,nij,nj->n", errors, inverses, errors)
-
-    @property
-    def independent(self) -> NDArray[np.bool_]:
-        """Which of the claimed poses are `INDEPENDENT` m apart, the last one among them, shape (m,)."""
-        left = (self.drive.travelled[-1] - self.drive.travelled)[self.is_localized]
-        marks = np.floor(left / INDEPENDENT)
-        is_independent: NDArray[np.bool_] = (
-            np.append(marks[:-1] != marks[1:], True) if len(marks) else np.zeros(0, dtype=bool)
-        )
-        return is_independent
-
-    @property
-    def first_fix(self) -> tuple[float, float]:
-        """The time (s) and the distance travelled (m) until the first pose; infinite if there was none."""
-        if not self.is_localized.any():
-            return np.inf, np.inf
-        first = int(np.argmax(self.is_localized))
-        return float(self.drive.times[first] - self.drive.times[0]), float(self.drive.travelled[first])
-
-    @property
-    def losses(self) -> int:
-        """The number of times that the unit lost its pose."""
-        return int(((self.status[:-1] != LOST) & (self.status[1:] == LOST)).sum())
-
-
-def memories(drive: Drive, unit: LocalizationUnit) -> Iterator[UnitState]:
-    """Yield the memory of a unit after each scan of a drive that begins without a guess."""
-    state = unit.start()
-    for landmarks, X_OH, time in zip(drive.landmarks, drive.reckoned, drive.times, strict=True):
-        _, state = unit.step(state, landmarks, X_OH=X_OH, time=float(time))
-        yield state
-
-
-def localize(drive: Drive, unit: LocalizationUnit) -> Track:
-    """Return the answers of a unit along a drive that begins without a guess."""
-    return track_of(drive, [state.answer for state in memories(drive, unit)])
-
-
-def track_of(drive: Drive, answers: Sequence[Localization]) -> Track:
-    """Return the answers to the scans of a drive, one each, as arrays."""
-    return Track(
-        drive,
-        np.array([answer.pose for answer in answers]),
-        np.array([answer.covariance for answer in answers]),
-        np.array([answer.status for answer in answers]),
-    )
-
-
-def simulated_drive(
-    stand: Stand,
-    *,
-    seed: int,
-    length: float,
-    detector: Detector | None = None,
-    odometry: Odometry | None = None,
-    scans: float = SCANS,
-) -> Drive:
-    """Return a drive at 1 m/s on a circle in the middle of a stand, with simulated detections.
-
-    Args:
-        stand: The stand, in which the circle has a radius of a third of its smaller extent.
-        seed: Determines the start of the drive, false trunks, detections and drift.
-        length: The length of the drive in m.
-        detector: The performance of the detector; by default `Detector`.
-        odometry: The drift of the dead reckoning; by default `Odometry`.
-        scans: The number of scans per second.
-    """
-    detector, odometry = detector or Detector(), odometry or Odometry()
-    rng = np.random.default_rng([seed, 8])
-    wood = Wood.of(stand, false=detector.false, rng=rng)
-    radius, angle = min(stand.length, stand.width) / 3.0, rng.uniform(-np.pi, np.pi)
-    middle = 0.5 * np.array([stand.length, stand.width])
-    begin = [*(middle + radius * np.array([np.cos(angle), np.sin(angle)])), angle + np.pi / 2.0]
-    truth = arc(begin, length=length, curvature=1.0 / radius, step=1.0 / scans)
-    return Drive(
-        np.arange(len(truth)) / scans,
-        truth,
-        dead_reckoned(truth, odometry, rng),
-        tuple(wood.detected(X_WH, detector, rng)[0] for X_WH in truth),
-    )
-
-
-def recorded_drive(scenario: CarrierScenario, *, length: float, detectors: Sequence[LandmarkSensor] = ()) -> Drive:
-    """Simulate a carrier that stands at first, and return what its DPS detects in each sample, and its odometry.
-
-    Args:
-        scenario: The carrier in its world; its map does not matter.
-        length: The length of the drive in m.
-        detectors: What detects landmarks in the scans instead of the unit's sensors, each in a view of its own.
-
-    Raises:
-        RuntimeError: The drive takes more than twice the time that it should.
-    """
-    testbed = scenario.build()
-    pose, history = (testbed.reader(address) for address in (_POSE, _HISTORY))
-    sensors = [_SensorReader.of(testbed, sensor) for sensor in detectors or scenario.sensors()]
-    periods = scenario.perception_periods[:1] * len(detectors) if detectors else scenario.perception_periods
-    simulator = testbed.simulator()
-    context = simulator.get_mutable_context()
-    testbed.write(context, {_SPEED: 0.0})
-    limit = STANDING + 2.0 * length / scenario.speed + 10.0
-    rows: list[tuple[float, Array, Array, Array]] = []
-    views: list[Views] = []
-    travelled = 0.0
-    for due, shown in _due(periods):
-        if travelled >= length:
-            break
-        if due > limit:
-            raise RuntimeError(f"the carrier has driven {travelled:.1f} m of {length:g} m in {limit:.0f} s")
-        # Just before the plant steps to its next state: due may be later than that by a rounding error.
-        simulator.AdvanceTo(due - 1e-9)
-        if due > STANDING:
-            testbed.write(context, {_SPEED: scenario.speed})
-        x, y, _, roll, pitch, yaw = pose(context)
-        # By then the sample has arrived, and its time lies within the history.
-        simulator.AdvanceTo(due + 2.0 * PERIOD)
-        past, samples = history(context), [(sensors[k].sensor, sensors[k](context)) for k in shown]
-        sensor, inputs = samples[0]
-        taken = sensor.times(inputs)[-1]
-        reckoned_pose = carrier_pose_at(past, taken)
-        X_OH = np.array([reckoned_pose.x, reckoned_pose.y, reckoned_pose.heading])
-        tilt = np.array([reckoned_pose.roll - roll, reckoned_pose.pitch - pitch])
-        rows.append((taken, np.array([x, y, yaw]), X_OH, tilt))
-        views.append([sensor.view(inputs, past) for sensor, inputs in samples])
-        if len(rows) > 1:
-            travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
-    times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
-    return Drive(times, truths, reckoned, tuple(views), tilts)
-
-
-@dataclass(frozen=True)
-class _SensorReader:
-    """The reading of what a sensor of the unit shows to the DPS.
-
-    Attributes:
-        sensor: The sensor.
-        inputs: The functions that read samples and their times, by the names of the inputs of a `Localizer`.
-    """
-
-    sensor: LandmarkSensor
-    inputs: Mapping[str, Callable[[Context], Any]]
-
-    @classmethod
-    def of(cls, testbed: VirtualTestbed, sensor: LandmarkSensor) -> Self:
-        arrivals = {name: _ARRIVAL.format(signal=name) for name in sensor.signals}
-        samples = {name: testbed.reader(f"{arrival}.sample") for name, arrival in arrivals.items()}
-        times = {f"{name}_time": testbed.reader(f"{arrival}.time") for name, arrival in arrivals.items()}
-        return cls(sensor, samples | times)
-
-    def __call__(self, context: Context) -> dict[str, Any]:
-        return {name: read(context) for name, read in self.inputs.items()}
-
-
-def _due(periods: Sequence[float]) -> Iterator[tuple[float, list[int]]]:
-    """Yield the times at which sensors with these periods have new samples, and the numbers of these sensors."""
-    counts = np.ones(len(periods))
-    while True:
-        times = counts * periods
-        shown = np.flatnonzero(times < times.min() + 1e-6)
-        yield float(times.min()), shown.tolist()
-        counts[shown] += 1.0
 
 
 @dataclass(frozen=True)
@@ -371,115 +128,6 @@ def nees_bounds(count: int) -> tuple[float, float]:
         return 0.0, np.inf
     low, high = (chi2(3 * count).ppf([0.025, 0.975]) / count).tolist()
     return low, high
-
-
-def best_estimates(
-    path: Array, places: Array, displacements: Array, errors: MapErrors, *, noise: float = NOISE
-) -> tuple[Array, Array]:
-    """Return errors of the best unbiased estimate of the position along a path, and their variances.
-
-    At each point of the path, this estimate (of Gauss and Markov) has seen every tree within `REACH` of the path up to
-    there, and knows its position relative to the carrier to ``noise`` per axis. The heading is unknown. The map says
-    where the trees are, with the covariances C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis: what the
-    errors of all trees have in common can be inferred only from how they vary from place to place. An error [t; theta]
-    of the pose displaces the tree at d from the carrier by t + theta J d, where J is the rotation by a right angle. So
-
-        [t; theta] = (X' C^-1 X)^-1 X' C^-1 e,    X = [I, J d] for each tree,    covariance (X' C^-1 X)^-1.
-
-    Args:
-        path: The points in m, shape (m, 2).
-        places: The true positions of the trees that are on the map in m, shape (n, 2).
-        displacements: Their errors e on the map in m, shape (n, 2).
-        errors: The errors of the map.
-        noise: Standard deviation of the relative position of a tree, per axis, in m.
-
-    Returns:
-        The errors t in m, shape (m, 2), and their variances (of both axes together) in m^2, shape (m,). NaN where fewer
-        than two trees have been seen.
-    """
-    is_near = np.hypot(*(places[:, np.newaxis] - path).transpose(2, 0, 1)) < REACH
-    first = np.where(is_near.any(axis=1), is_near.argmax(axis=1), len(path))
-    order = np.argsort(first, kind="stable")[: np.count_nonzero(first < len(path))]
-    p, e = places[order], displacements[order]
-    squares = ((p[:, np.newaxis] - p) ** 2).sum(axis=2)
-    shared = np.exp(-0.5 * squares / errors.correlation**2) if errors.correlation > 0.0 else np.eye(len(p))
-    # With the trees in the order in which they are seen, those that were seen first are a leading block of C = L L'.
-    L = np.linalg.cholesky(errors.position**2 * shared + noise**2 * np.eye(len(p)))
-    Y = solve_triangular(L, np.column_stack([np.ones(len(p)), p, e]), lower=True)
-    sums = np.cumsum(Y[:, :, np.newaxis] * Y[:, np.newaxis, :], axis=0)
-    count = np.searchsorted(first[order], np.arange(len(path)), side="right")
-    is_seen = count >= 2
-    # Sums over pairs of trees, weighted by C^-1: of 1, x and y (from the carrier), and of their products with e.
-    G = np.empty((is_seen.sum(), 5, 5))
-    G[:] = sums[count[is_seen] - 1]
-    T = np.tile(np.eye(5), (len(G), 1, 1))
-    T[:, 1:3, 0] = -path[is_seen]
-    G = T @ G @ T.transpose(0, 2, 1)
-    zero = np.zeros(len(G))
-    A = np.array(
-        [
-            [G[:, 0, 0], zero, -G[:, 0, 2]],
-            [zero, G[:, 0, 0], G[:, 0, 1]],
-            [-G[:, 0, 2], G[:, 0, 1], G[:, 1, 1] + G[:, 2, 2]],
-        ]
-    ).transpose(2, 0, 1)
-    b = np.array([G[:, 0, 3], G[:, 0, 4], G[:, 1, 4] - G[:, 2, 3]]).T
-    covariance = np.linalg.inv(A)
-    estimates, variances = np.full((len(path), 2), np.nan), np.full(len(path), np.nan)
-    estimates[is_seen] = (covariance @ b[:, :, np.newaxis])[:, :2, 0]
-    variances[is_seen] = covariance[:, 0, 0] + covariance[:, 1, 1]
-    return estimates, variances
-
-
-@dataclass(frozen=True)
-class BestError:
-    """The errors of a unit beside the errors of the best estimate, `best_estimates`, at the same scans.
-
-    Attributes:
-        least: RMS error of the best estimate over all maps of this kind, in m.
-        on_maps: RMS error of the best estimate on the very maps of the drives, in m. It differs from ``least`` if the
-            maps are few.
-        ratio: RMS error of the unit over ``on_maps``.
-        interval: The interval of ``ratio`` with 95 % confidence, by drawing the forests again (bootstrap).
-    """
-
-    least: float
-    on_maps: float
-    ratio: float
-    interval: tuple[float, float]
-
-
-def against_best(
-    tracks: Mapping[int, Track], name: str, *, scenario: Callable[[int], CarrierScenario] | None = None
-) -> BestError:
-    """Compare the errors of a unit with the errors of the best estimate on the same maps.
-
-    Args:
-        tracks: The tracks by the seed of their scenario.
-        name: The name of the map in `MAPS`.
-        scenario: The function that returns the scenario of a seed; by default `forest`.
-    """
-    errors, sums, count = MAPS[name], [], 0
-    for seed, track in tracks.items():
-        survey = (scenario or forest)(seed).surveyed_map
-        # Without errors of the positions, the same survey has the same entries in the same order.
-        mapped, places = (
-            survey(survey_errors).positions()[:, :2] for survey_errors in (errors, replace(errors, position=0.0))
-        )
-        # A wrong entry is displaced from nothing.
-        is_true = (mapped != places).any(axis=1)
-        path = track.drive.truth[:, :2]
-        best, variances = best_estimates(path, places[is_true], (mapped - places)[is_true], errors)
-        both = track.is_localized & np.isfinite(variances)
-        units = (track.poses[:, :2] - path)[both]
-        sums.append([(units**2).sum(), (best[both] ** 2).sum(), variances[both].sum()])
-        count += int(both.sum())
-    unit, on_maps, least = (totals := np.array(sums)).sum(axis=0)
-    drawn = totals[np.random.default_rng(0).integers(len(totals), size=(_DRAWS, len(totals)))].sum(axis=1)
-    low, high = np.sqrt(np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])).tolist()
-    return BestError(
-        float(np.sqrt(least / count)), float(np.sqrt(on_maps / count)), float(np.sqrt(unit / on_maps)), (low, high)
-    )
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import Array, rms
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive, forest, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drive import STANDING, Drive, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drives import forest
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import add_results, read_results
 

@@ -38,7 +38,7 @@ from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import Track, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drive import Track, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 
 SEED = 410_000

@@ -32,15 +32,8 @@ from vtbdrake.cli.output import table
 from vtbdrake.common.arrays import rms
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake_diagrams.forest.scenario import CARRIERS, ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import (
-    GOALS,
-    Drive,
-    Track,
-    forest,
-    localize,
-    nees_bounds,
-    recorded_drive,
-)
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drives import GOALS, forest, nees_bounds
 from vtbdrake_diagrams.forest.world.stand import MAPS
 from vtbdrake_diagrams.kept_results import add_results, read_results
 

@@ -44,17 +44,8 @@ from vtbdrake.components.localization.track_state import landmark_columns
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import LocalizationUnit, UnitState
 from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
-from vtbdrake_diagrams.forest.studies.drives import (
-    DENSITIES,
-    Drive,
-    Track,
-    forest,
-    memories,
-    nees_bounds,
-    recorded_drive,
-    simulated_drive,
-    track_of,
-)
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track, memories, recorded_drive, simulated_drive, track_of
+from vtbdrake_diagrams.forest.studies.drives import DENSITIES, forest, nees_bounds
 from vtbdrake_diagrams.forest.world.stand import Stand
 from vtbdrake_diagrams.kept_results import read_results, write_results
 from vtbdrake_diagrams.processes import in_processes

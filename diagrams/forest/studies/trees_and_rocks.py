@@ -27,13 +27,8 @@ from threadpoolctl import threadpool_limits
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake_diagrams.forest.perception import LandmarkSensor
 from vtbdrake_diagrams.forest.scenario import LANDMARKS, ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import (
-    ABUNDANCES,
-    Drive,
-    forest,
-    localize,
-    recorded_drive,
-)
+from vtbdrake_diagrams.forest.studies.drive import Drive, localize, recorded_drive
+from vtbdrake_diagrams.forest.studies.drives import ABUNDANCES, forest
 from vtbdrake_diagrams.forest.studies.on_foot import MAP_NAMES, Way, Ways, judged, load, report, summary
 from vtbdrake_diagrams.kept_results import add_results
 from vtbdrake_diagrams.plain.scenario import scanner_config

@@ -16,7 +16,7 @@ from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.localization.write_back import written_back
 from vtbdrake.components.world_model import WorldModel, add_to_plant
 from vtbdrake_diagrams.forest.studies.detections import Detector
-from vtbdrake_diagrams.forest.studies.drives import memories, simulated_drive
+from vtbdrake_diagrams.forest.studies.drive import memories, simulated_drive
 from vtbdrake_diagrams.forest.world.stand import Stand
 
 pytestmark = pytest.mark.one_python

@@ -12,7 +12,7 @@ from vtbdrake.components.localization.unit import DOUBTFUL, TRACKING
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies import next_route, scanner_choice
-from vtbdrake_diagrams.forest.studies.drives import Drive, Track, localize, simulated_drive
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track, localize, simulated_drive
 from vtbdrake_diagrams.forest.studies.next_route import (
     COUNTED,
     FOUND,

@@ -10,22 +10,8 @@ from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
-from vtbdrake_diagrams.forest.studies.drives import (
-    GOALS,
-    SOURCES,
-    STANDING,
-    Drive,
-    Drives,
-    Track,
-    forest,
-    localize,
-    main,
-    nees_bounds,
-    plain,
-    recorded_drive,
-    score,
-    simulated_drive,
-)
+from vtbdrake_diagrams.forest.studies.drive import STANDING, Drive, Track, localize, recorded_drive, simulated_drive
+from vtbdrake_diagrams.forest.studies.drives import GOALS, SOURCES, Drives, forest, main, nees_bounds, plain, score
 from vtbdrake_diagrams.forest.world.stand import Stand
 from vtbdrake_diagrams.plain.scenario import PlainScenario
 

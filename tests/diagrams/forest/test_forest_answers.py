@@ -9,16 +9,9 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.answers import LocalizationAnswer, OverLcm, over_lcm
-from vtbdrake_diagrams.forest.studies.drives import (
-    GOALS,
-    REACH,
-    BestError,
-    Drive,
-    Score,
-    Track,
-    against_best,
-    best_estimates,
-)
+from vtbdrake_diagrams.forest.studies.best_estimate import REACH, BestError, against_best, best_estimates
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track
+from vtbdrake_diagrams.forest.studies.drives import GOALS, Score
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors
 
 POOR = MAPS["poor"]

@@ -15,7 +15,7 @@ from vtbdrake_diagrams.forest.perception import LandmarkSensor, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
 from vtbdrake_diagrams.forest.studies import fusion
-from vtbdrake_diagrams.forest.studies.drives import STANDING, Drive
+from vtbdrake_diagrams.forest.studies.drive import STANDING, Drive
 from vtbdrake_diagrams.forest.studies.fusion import (
     CONDITIONS,
     MAP_NAMES,

@@ -11,7 +11,7 @@ from vtbdrake.components.localization.landmarks import Landmarks, SensorView
 from vtbdrake.components.localization.unit import SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.scenario import CARRIERS, LANDMARKS
 from vtbdrake_diagrams.forest.studies import on_foot, trees_and_rocks
-from vtbdrake_diagrams.forest.studies.drives import Drive, Track
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track
 from vtbdrake_diagrams.forest.studies.on_foot import MAP_NAMES, Way, carried, holds, judged, load, report, summary
 from vtbdrake_diagrams.forest.studies.trees_and_rocks import both_no_worse, with_landmarks
 

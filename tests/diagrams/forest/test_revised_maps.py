@@ -15,7 +15,7 @@ from vtbdrake.components.localization.track_state import FIXED, TrackState
 from vtbdrake.components.localization.unit import TRACKING, UnitState
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies import revised_maps
-from vtbdrake_diagrams.forest.studies.drives import Drive, Track
+from vtbdrake_diagrams.forest.studies.drive import Drive, Track
 from vtbdrake_diagrams.forest.studies.revised_maps import (
     DEVIATIONS,
     FORESTS,
