@@ -7,7 +7,7 @@ their detections are left, and a tenth of all others, which show nothing on the 
 without a guess. The survey, which uses all detections together, also later ones, judges each claim, but for the places
 where it contradicts the wheels (`judging`).
 
-The unit was developed with the draws 0 to 2, and with what the draws 3 and 17 showed; the others judge.
+The unit was developed with the draws 0 to 2, and with what the draws 3, 17 and 20 showed; the others judge.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform
 from vtbdrake.components.localization.range_bearing import RangeBearingConfig, range_bearing_landmarks
 from vtbdrake.components.localization.unit import TRACKING
-from vtbdrake_diagrams.park.reality import Drive, prepared, reckoned, surveyed, victoria_park
-from vtbdrake_diagrams.park.scenario import ParkScenario, car
+from vtbdrake_diagrams.park.reality import Drive, Prepared, prepared, reckoned, surveyed, victoria_park
+from vtbdrake_diagrams.park.scenario import ParkScenario
 from vtbdrake_diagrams.park.survey import Survey
 from vtbdrake_diagrams.park.world import tree_model
 
@@ -54,6 +54,10 @@ _JUMP = 3.0
 _SURVEYED = 0.05
 # Standard deviation of a motion by the wheels for lasting errors, as a share of the way.
 _LASTING = 0.02
+# Turns are compared over this time, in s.
+_CURVE = 3.0
+# Only turns of more than this angle are compared, in rad.
+_LEAST_TURN = 0.7
 # For this time after a jump the survey does not judge, in s.
 _AFTER_JUMP = 10.0
 # Nor between two jumps within this time, in s: it is displaced from the one to the other.
@@ -175,6 +179,34 @@ def stray_density(drive: Drive, mapped: Survey, detector: RangeBearingConfig) ->
     return strays / float((distances < nearest).sum()) / (np.pi * (farthest**2 - nearest**2))
 
 
+def as_published(scenario: ParkScenario) -> ParkScenario:
+    """Return a scenario with the published car, and a steering that nobody has calibrated."""
+    published = ParkScenario()
+    return replace(scenario, car=published.car, steering_deviation=published.steering_deviation)
+
+
+def turn_errors(mapped: Survey, wheels: Array) -> Array:
+    """Return by which share of themselves dead reckoning measures turns too large, (m,).
+
+    These are the turns of more than 0.7 rad in 3 s, where the survey judges.
+
+    Args:
+        mapped: The survey.
+        wheels: The poses by dead reckoning at its times, (n, 3), with headings that are not wrapped.
+    """
+    times = mapped.times
+    first = np.searchsorted(times, np.arange(times[0], times[-1] - _CURVE, _CURVE))
+    last = np.searchsorted(times, times[first] + _CURVE)
+    is_inside = last < len(times)
+    first, last = first[is_inside], last[is_inside]
+    measured, true = (np.unwrap(poses[:, 2])[last] - np.unwrap(poses[:, 2])[first] for poses in (wheels, mapped.poses))
+    is_judged = judging(mapped, wheels)
+    is_curve = np.array([is_judged[i : j + 1].all() for i, j in zip(first, last, strict=True)], dtype=bool)
+    is_curve &= np.abs(measured) > _LEAST_TURN
+    errors: Array = 1.0 - true[is_curve] / measured[is_curve]
+    return errors
+
+
 def claims(
     drive: Drive, whole: Survey, scenario: ParkScenario, case: Case, *, seed: int, trees: int = _TREES
 ) -> Claims:
@@ -196,10 +228,10 @@ def claims(
         positions=(true.positions + errors) * [1.0, -1.0 if case.is_mirrored else 1.0],
         covariances=np.tile(case.deviation**2 * np.eye(2), (len(true), 1, 1)),
     )
-    unit = scenario.unit(tree_model(mapped, source="survey"))
-    steered = scenario.car if case.is_calibrated else car()
+    told = scenario if case.is_calibrated else as_published(scenario)
+    unit = told.unit(tree_model(mapped, source="survey"))
     times = drive.log.sense["trees"].times
-    poses, state, answers = reckoned(drive.log.sense["odometry"], steered, times), unit.start(), []
+    poses, state, answers = reckoned(drive.log.sense["odometry"], told.car, times), unit.start(), []
     with threadpool_limits(1):
         for time, X_OH, scan in zip(times, poses, scans, strict=True):
             answer, state = unit.step(state, scan, X_OH=X_OH, time=time)
@@ -254,7 +286,16 @@ def report(drive: Drive, seeds: Sequence[int]) -> str:
     is_judged = draws[CASES[0]][0].is_judged
     judge = f"the survey judges {is_judged.sum()} of {len(is_judged)} scans; draws {', '.join(map(str, seeds))}"
     beside = f"first half: {strays:.4f} detections of something else per m^2 beside a tree, for each of the tree"
-    return f"{beside}\n{judge}\n{tabulated(draws)}"
+    return "\n".join([beside, _turned(first, half), judge, tabulated(draws)])
+
+
+def _turned(first: Drive, half: Prepared) -> str:
+    """Return the line on the errors of turns of the first half, with both kinds of steering."""
+    parts = []
+    for label, car in (("calibrated", half.scenario.car), ("published", as_published(half.scenario).car)):
+        errors = turn_errors(half.mapped, reckoned(first.log.sense["odometry"], car, half.mapped.times))
+        parts.append(f"{np.sqrt(np.mean(errors**2)):.3f}, {np.abs(errors).max():.3f} {label}")
+    return f"first half: error of sharp turns, as a share, RMS and largest: {'; '.join(parts)}"
 
 
 def tabulated(draws: Mapping[Case, Sequence[Claims]]) -> str:

@@ -40,7 +40,6 @@ from vtbdrake.common.arrays import Array, Indices, rms
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse
-from vtbdrake.components.localization.track_state import landmark_columns
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import LocalizationUnit, UnitState
 from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
@@ -259,7 +258,7 @@ def joint_nees(state: UnitState, rows: Indices, places: Array, *, lasting: float
         return 0.0, 0
     track = state.track
     errors = (track.landmark_positions[rows] - places).ravel()
-    columns = landmark_columns(rows).ravel()
+    columns = track.landmark_columns(rows).ravel()
     P = track.covariance[np.ix_(columns, columns)] + lasting**2 * np.eye(len(columns))
     return float(errors @ np.linalg.solve(P, errors)), len(errors)
 

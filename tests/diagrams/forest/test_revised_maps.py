@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from tests.diagrams.forest.riding import RidingScenario
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.track_state import FIXED, TrackState
+from vtbdrake.components.localization.track_state import RATE, TrackState
 from vtbdrake.components.localization.unit import TRACKING, UnitState
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies import revised_maps
@@ -96,15 +96,15 @@ def test_wrong_claims_are_far_off_and_improbable() -> None:
 
 
 def test_joint_nees_of_errors_that_are_as_claimed_is_chi_square_distributed() -> None:
-    rng, k = np.random.default_rng(1), 30
-    root = rng.normal(size=(FIXED + 2 * k, FIXED + 2 * k))
+    rng, k, first = np.random.default_rng(1), 30, RATE + 1
+    root = rng.normal(size=(first + 2 * k, first + 2 * k))
     P = 0.01 * root @ root.T
     places = rng.uniform(0.0, 50.0, (k, 2))
     values = []
     for _ in range(50):
         # Each detection of a landmark has an error of its own in common with its others.
         mean = rng.multivariate_normal(np.zeros(len(P)), P) + 0.3 * rng.normal(size=len(P))
-        mean[FIXED:] += places.ravel()
+        mean[first:] += places.ravel()
         track = TrackState(mean, P, np.arange(k), np.ones(k, dtype=bool))
         rows = np.array([3, 7, 20])
         square, freedom = joint_nees(UnitState(track=track), rows, places[rows], lasting=0.3)

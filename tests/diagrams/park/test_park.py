@@ -14,7 +14,17 @@ from vtbdrake.components.localization.range_bearing import RangeBearingConfig, r
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.recording import Log, Series
 from vtbdrake_diagrams.park import ParkScenario
-from vtbdrake_diagrams.park.few_landmarks import Case, Claims, claims, judging, stray_density, tabulated, thinned
+from vtbdrake_diagrams.park.few_landmarks import (
+    Case,
+    Claims,
+    as_published,
+    claims,
+    judging,
+    stray_density,
+    tabulated,
+    thinned,
+    turn_errors,
+)
 from vtbdrake_diagrams.park.reality import (
     Drive,
     judged_by_positions,
@@ -178,6 +188,42 @@ def test_density_of_simulated_detections_beside_a_tree():
     mapped = Survey(np.arange(10.0), np.zeros((10, 3)), tree, 0.0)
     density = stray_density(Drive(log, np.zeros((0, 3))), mapped, RangeBearingConfig())
     assert density == pytest.approx(1.0 / 9.0 / (np.pi * (1.0 - 0.16)))
+
+
+@pytest.mark.slow
+def test_real_steering_errs_in_turns_as_assumed(drive, half):
+    """The shares are about what `ParkScenario` assumes; few_landmarks prints the whole first half's."""
+    odometry = drive.between(0.0, 200.0).log.sense["odometry"]
+    for scenario in (half.scenario, as_published(half.scenario)):
+        errors = turn_errors(half.mapped, reckoned(odometry, scenario.car, half.mapped.times))
+        assert len(errors) > 10
+        assert 0.6 < np.sqrt(np.mean(errors**2)) / scenario.steering_deviation < 1.4
+
+
+def test_turns_of_a_simulated_steering_with_a_wrong_scale():
+    """Every 30 s, the car turns by 1 rad in 3 s, and 15 s later by half a rad, which does not count."""
+    rates = np.zeros(1000)
+    for first in range(0, 1000, 150):
+        rates[first : first + 15], rates[first + 75 : first + 90] = 1.0 / 15.0, -0.5 / 15.0
+
+    def path(turns):
+        poses = [np.zeros(3)]
+        for turn in turns:
+            poses.append(compose(poses[-1], [0.2, 0.0, turn]))
+        return np.array(poses)
+
+    wheels = path(1.1 * rates)
+    wheels[:, 2] = np.unwrap(wheels[:, 2])
+    errors = turn_errors(Survey(0.2 * np.arange(1001), path(rates), Landmarks.empty(), 0.0), wheels)
+    assert len(errors) == 7
+    np.testing.assert_allclose(errors, 1.0 - 1.0 / 1.1, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_published_steering_is_believed_less_than_a_calibrated_one(half):
+    published = as_published(half.scenario)
+    assert published.car == ParkScenario().car != half.scenario.car
+    assert published.steering_deviation > half.scenario.steering_deviation > 0.0
 
 
 @pytest.mark.slow

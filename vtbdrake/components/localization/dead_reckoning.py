@@ -129,8 +129,9 @@ class SteeringDriftModel(DriftModel):
 
     An error of the angle turns the carrier while it drives, and not while it stands: the heading's error grows with the
     distance. The lasting error g of a `Tracker` is then an error of the curvature, ``rate_deviation`` and ``rate_walk``
-    are in rad/m and rad/m^1.5. The defaults fit a car on grass: rounded from the first half of the drive in
-    Victoria Park, see `vtbdrake_diagrams.park`.
+    are in rad/m and rad/m^1.5. A wrong scale of the angle, which adds up in a curve, is not part of this model: the
+    tracker has the lasting error f for it, with ``turn_deviation``. The defaults fit a car on grass: rounded from the
+    first half of the drive in Victoria Park, see `vtbdrake_diagrams.park`.
     """
 
     along: float = setting(0.05, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)

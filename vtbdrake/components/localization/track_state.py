@@ -1,6 +1,7 @@
 """The memory of a `Tracker`: the state x of its filter with its covariance, and the health of the track.
 
-x = [X_WH; b; e; g; l_1; ...; l_n], see `vtbdrake.components.localization.tracking`.
+x = [X_WH; b; e; g; f; l_1; ...; l_n], see `vtbdrake.components.localization.tracking`; without f if the scale of turns
+is taken as exact.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ ODOMETRY = 4
 """The place of e in x."""
 RATE = 5
 """The place of g in x."""
-FIXED = 6
-"""The place of the first landmark in x."""
+TURN = 6
+"""The place of f in x, if x has it."""
 
 
 @immutable
@@ -30,8 +31,8 @@ class TrackState:
     """The memory of a `Tracker`: an immutable value with read-only arrays.
 
     Attributes:
-        mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
-        covariance: The covariance of x, shape (6 + 2 n, 6 + 2 n).
+        mean: The estimate of x (m, rad, s), shape (6 + 2 n,) or, with f, (7 + 2 n,); empty if nothing is tracked.
+        covariance: The covariance of x.
         indices: Indices on the map of the landmarks in x, shape (n,); those that the map lacks are numbered from its
             size on.
         is_recent: Whether each of them was seen in the last scan that was fused and had it in view, shape (n,).
@@ -96,15 +97,28 @@ class TrackState:
         return float(self.mean[BIAS])
 
     @property
+    def first_landmark(self) -> int:
+        """The place of the first landmark in x."""
+        return len(self.mean) - 2 * len(self.indices)
+
+    @property
     def landmark_positions(self) -> Array:
         """The estimated positions l_i of the landmarks in x, in W in m, shape (n, 2)."""
-        return self.mean[FIXED:].reshape(-1, 2)
+        return self.mean[self.first_landmark :].reshape(-1, 2)
+
+    def landmark_columns(self, rows: Indices) -> Indices:
+        """Return the places in x of landmarks, shape (m, 2).
+
+        Args:
+            rows: Their places among the landmarks in x, (m,).
+        """
+        return self.first_landmark + 2 * rows[:, None] + np.arange(2)
 
     def without(self, mask: NDArray[np.bool_]) -> TrackState:
         """Return the state without the landmarks for which the mask (n,) is true."""
         if not mask.any():
             return self
-        remains = np.concatenate([np.ones(FIXED, dtype=bool), np.repeat(~mask, 2)])
+        remains = np.concatenate([np.ones(self.first_landmark, dtype=bool), np.repeat(~mask, 2)])
         return self.with_arrays(
             mean=self.mean[remains],
             covariance=self.covariance[np.ix_(remains, remains)],
@@ -122,8 +136,3 @@ def in_level_frame(state: TrackState, places: Array) -> Array:
         places: The places in W, (n, 2).
     """
     return (places - state.mean[:2]) @ rotation(-state.mean[2]).T
-
-
-def landmark_columns(rows: Indices) -> Indices:
-    """Return the places in x of landmarks, rows of the state, shape (m, 2)."""
-    return FIXED + 2 * rows[:, None] + np.arange(2)

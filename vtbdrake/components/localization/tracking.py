@@ -1,10 +1,11 @@
 """Tracking of a carrier among landmarks of a map, from a first pose on: simultaneous localization and map refinement.
 
-The state x = [X_WH; b; e; g; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector,
-two lasting errors e and g of dead reckoning, and the true positions l_i (in W) of those landmarks of the map that have
-been seen. Each landmark enters the state once, with its position on the map and the error of the map as the prior; from
-then on it is refined by detections, and correlated with the pose. A filter that takes the map's error as independent in
-each scan would become overconfident, because it is the same error. A detection z of landmark l in the level frame H is
+The state x = [X_WH; b; e; g; f; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector,
+three lasting errors e, g and f of dead reckoning, and the true positions l_i (in W) of those landmarks of the map that
+have been seen. Each landmark enters the state once, with its position on the map and the error of the map as the prior;
+from then on it is refined by detections, and correlated with the pose. A filter that takes the map's error as
+independent in each scan would become overconfident, because it is the same error. A detection z of landmark l in the
+level frame H is
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
@@ -22,14 +23,16 @@ rotation by a right angle. A correction is applied by the exponential map of the
 moves by V(θ) times its step to first order, V(θ) = [sin θ I + (1 - cos θ) J] / θ. So what turns with the carrier moves
 on an arc, and what the map holds stays in its place.
 
-Dead reckoning measures a motion [t; turn] in the time T. It is too long by its share e, and its gyros have the bias g:
+Dead reckoning measures a motion [t; turn] in the time T. It is too long by its share e, its gyros have the bias g, and
+its turns are too large by their share f:
 
-    true motion = [(1 - e) R(-g T / 2) t; turn - g T] + noise.
+    true motion = [(1 - e) R(-δ / 2) t; turn - δ] + noise,    δ = g T + f turn.
 
-e is a first-order Gauss-Markov process over the distance travelled, because the slip of wheels depends on the slope; g
-is a random walk in time. With a steering angle in place of gyros, T is the distance, and g an error of the curvature.
-Noise alone, independent from step to step, would be too small after a minute without landmarks. e and g are estimated
-while landmarks are seen.
+e and f are first-order Gauss-Markov processes over the distance travelled, because the slip of wheels depends on the
+slope; g is a random walk in time. With a steering angle in place of gyros, T is the distance, g an error of the
+curvature, and f one of the angle's scale, which is another one in a sharper curve. Noise alone, independent from step
+to step, would be too small after a minute, or a curve, without landmarks. e, g and f are estimated while landmarks are
+seen.
 
 Errors of a map may be correlated: neighbours are displaced alike. With M_ij = c σ_i σ_j exp(-r_ij² / (2 L²)) +
 (1 - c) σ_i² δ_ij for the errors of the landmarks, per axis, the prior of a landmark that is seen for the first time is
@@ -87,12 +90,11 @@ from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.revision import MapChanges, is_in_plain_view, places_of
 from vtbdrake.components.localization.track_state import (
     BIAS,
-    FIXED,
     ODOMETRY,
     RATE,
+    TURN,
     TrackState,
     in_level_frame,
-    landmark_columns,
 )
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
@@ -247,6 +249,12 @@ class Tracker:
         unit="1/m^2",
         ge=0.0,
     )
+    turn_deviation: float = setting(
+        0.0,
+        "Standard deviation of f, the error of the scale of turns, which lasts as long as e; 0, as for gyros: none is "
+        "estimated.",
+        ge=0.0,
+    )
     _association: Association = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -298,24 +306,29 @@ class Tracker:
         """
         measured = np.asarray(motion, dtype=float)
         mean, P, heading = state.mean.copy(), state.covariance.copy(), state.mean[2]
-        turned = mean[RATE] * extent
+        # How much the errors g and f turn the carrier, each of size 1.
+        first = state.first_landmark
+        levers = np.array([extent, measured[2]])[: first - RATE]
+        turned = float(levers @ mean[RATE:first])
         way = rotation(-turned / 2.0) @ measured[:2]
         move = np.array([*((1.0 - mean[ODOMETRY]) * way), measured[2] - turned])
         F, G = np.eye(3), block_diag(rotation(heading), 1.0)
         F[:2, 2] = rotation(heading + np.pi / 2.0) @ move[:2]
-        aside = 0.5 * extent * move[:2]
-        # The derivatives of the pose with respect to e and g.
-        B = -G @ np.array([[way[0], -aside[1]], [way[1], aside[0]], [0.0, extent]])
+        # The derivatives of the pose with respect to e, g and f.
+        along, by_turn = np.array([*way, 0.0]), np.array([-0.5 * move[1], 0.5 * move[0], 1.0])
+        B = -G @ np.column_stack([along, np.outer(by_turn, levers)])
         mean[:3] = compose(mean[:3], move)
-        P[:3] = F @ P[:3] + B @ P[ODOMETRY:FIXED]
-        P[:, :3] = P[:, :3] @ F.T + P[:, ODOMETRY:FIXED] @ B.T
+        P[:3] = F @ P[:3] + B @ P[ODOMETRY:first]
+        P[:, :3] = P[:, :3] @ F.T + P[:, ODOMETRY:first] @ B.T
         P[:3, :3] += state.drift * G @ np.asarray(covariance, dtype=float) @ G.T
         P[RATE, RATE] += self.rate_walk**2 * abs(extent)
         decay = float(np.exp(-np.hypot(*measured[:2]) / self.odometry_length))
-        mean[ODOMETRY] *= decay
-        P[ODOMETRY] *= decay
-        P[:, ODOMETRY] *= decay
-        P[ODOMETRY, ODOMETRY] += (1.0 - decay**2) * self.odometry_deviation**2
+        for row, deviation in ((ODOMETRY, self.odometry_deviation), (TURN, self.turn_deviation)):
+            if row < first:
+                mean[row] *= decay
+                P[row] *= decay
+                P[:, row] *= decay
+                P[row, row] += (1.0 - decay**2) * deviation**2
         travelled = state.travelled + float(np.hypot(*measured[:2]))
         return replace(state.with_arrays(mean=mean, covariance=P), travelled=travelled)
 
@@ -383,7 +396,7 @@ class Tracker:
         is_added = ~self._is_mapped(state.indices) & np.isin(state.indices, state.revision.sure)
         rows = np.flatnonzero(is_added)
         places = state.landmark_positions[rows]
-        covariances = np.array([state.covariance[np.ix_(columns, columns)] for columns in landmark_columns(rows)])
+        covariances = np.array([state.covariance[np.ix_(columns, columns)] for columns in state.landmark_columns(rows)])
         diameters, deviations = self._sizes(state, state.indices[rows])
         covariances = covariances.reshape(-1, 2, 2) + self.lasting_deviation**2 * np.eye(2)
         landmarks = Landmarks(places, covariances, diameters, deviations)
@@ -405,8 +418,11 @@ class Tracker:
         return replace(view, landmarks=view.landmarks.widened(self.least_deviation))
 
     def _at(self, X_WH: Array, covariance: Array) -> TrackState:
-        P = block_diag(covariance, self.bias_deviation**2, self.odometry_deviation**2, self.rate_deviation**2)
-        mean = np.concatenate([X_WH, np.zeros(FIXED - 3)])
+        lasting = [self.bias_deviation, self.odometry_deviation, self.rate_deviation]
+        # An error that is none needs no place in x.
+        lasting += [self.turn_deviation] * (self.turn_deviation > 0.0)
+        P = block_diag(covariance, np.diag(lasting) ** 2)
+        mean = np.concatenate([X_WH, np.zeros(len(lasting))])
         return replace(TrackState.none(), mean=mean, covariance=P, evidence=self.first_credit)
 
     def _extended(self, state: TrackState, indices: Indices, probability: Array | None = None) -> TrackState:
@@ -436,10 +452,11 @@ class Tracker:
             prior, J = np.kron(state.scatter * rest, np.eye(2)), np.zeros((2 * m, 2 * n))
             J[:, np.repeat(is_mapped, 2)] = np.kron(weights.T, np.eye(2))
             added = places[indices] + weights.T @ (state.landmark_positions[is_mapped] - places[mapped])
-        cross = J @ P[FIXED:]
+        first = state.first_landmark
+        cross = J @ P[first:]
         return state.with_arrays(
             mean=np.concatenate([mean, added.ravel()]),
-            covariance=np.block([[P, cross.T], [cross, cross[:, FIXED:] @ J.T + prior]]),
+            covariance=np.block([[P, cross.T], [cross, cross[:, first:] @ J.T + prior]]),
             indices=np.concatenate([state.indices, indices]),
             is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
             seen_at=np.concatenate([state.seen_at, np.full(m, -inf)]),
@@ -482,7 +499,8 @@ class Tracker:
         extended = self._extended(state, identities[~np.isin(identities, state.indices)])
         rows = np.flatnonzero(np.isin(extended.indices, identities))
         positions, H = self._expected(extended, rows, is_scan=view.is_scan)
-        HPHt = _times(H, rows, _times_transpose(extended.covariance, H, rows))
+        columns = extended.landmark_columns(rows)
+        HPHt = _times(H, columns, _times_transpose(extended.covariance, H, columns))
         covariance = HPHt.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
         return ExpectedDetections(extended.indices[rows], rows >= len(state.indices), positions, covariance)
 
@@ -494,8 +512,9 @@ class Tracker:
             rows = places_of(state.indices, pairs[:, 1])
             expected, H = self._expected(state, rows, is_scan=view.is_scan)
             nu = (detections.positions[pairs[:, 0]] - expected).ravel()
-            PHt = _times_transpose(state.covariance, H, rows)
-            S = _times(H, rows, PHt) + block_diag(*detections.covariances[pairs[:, 0]])
+            columns = state.landmark_columns(rows)
+            PHt = _times_transpose(state.covariance, H, columns)
+            S = _times(H, columns, PHt) + block_diag(*detections.covariances[pairs[:, 0]])
             S += self.scan_deviation**2 * np.tile(np.eye(2), (len(pairs), len(pairs)))
             factor = cho_factor(S, lower=True)
             weighted = cho_solve(factor, nu)
@@ -516,7 +535,7 @@ class Tracker:
             P = state.covariance - PHt @ information @ PHt.T
         else:
             P = state.covariance - PHt @ cho_solve(factor, PHt.T)
-        mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted)
+        mean, P = _corrected(state.mean, 0.5 * (P + P.T), PHt @ weighted, first=state.first_landmark)
         seen_at = state.seen_at.copy()
         seen_at[rows] = state.travelled
         is_in_view = view.is_in_view(in_level_frame(state, state.landmark_positions), share=inf)
@@ -683,17 +702,18 @@ def _mixed(S: Array, nu: Array, is_right: NDArray[np.bool_], weights: Array) -> 
     return a, B
 
 
-def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
+def _corrected(mean: Array, P: Array, step: Array, *, first: int) -> tuple[Array, Array]:
     """Return the estimate after a correction, and its covariance.
 
     Args:
         mean: The estimate before, (N,).
         P: The covariance after the correction, as errors displace points about that estimate, (N, N).
         step: The correction to first order, (N,).
+        first: The place of the first landmark.
     """
     J, turn, corrected, lever = rotation(pi / 2.0), step[2], mean + step, np.zeros(len(mean))
     V = np.sinc(turn / pi) * np.eye(2) + np.sinc(0.5 * turn / pi) * sin(0.5 * turn) * J
-    for points in (slice(0, 2), slice(FIXED, None)):
+    for points in (slice(0, 2), slice(first, None)):
         moved = step[points].reshape(-1, 2) @ V.T
         corrected[points] = mean[points] + moved.ravel()
         # An error of the heading displaces the corrected points by this much more.
@@ -702,12 +722,12 @@ def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
     return corrected, P + np.outer(P[:, 2], lever)
 
 
-def _times_transpose(P: Array, H: Array, rows: Indices) -> Array:
-    """Return P Hᵀ, shape (N, 2 m), for derivatives (m, 2, 6)."""
-    by_landmark = np.einsum("Nmj,mij->Nmi", P[:, landmark_columns(rows)], H[:, :, _OBSERVED:])
+def _times_transpose(P: Array, H: Array, columns: Indices) -> Array:
+    """Return P Hᵀ, shape (N, 2 m), for derivatives (m, 2, 6) with respect to landmarks in these columns (m, 2)."""
+    by_landmark = np.einsum("Nmj,mij->Nmi", P[:, columns], H[:, :, _OBSERVED:])
     return P[:, :_OBSERVED] @ H[:, :, :_OBSERVED].reshape(-1, _OBSERVED).T + by_landmark.reshape(len(P), -1)
 
 
-def _times(H: Array, rows: Indices, columns: Array) -> Array:
-    """Return H times columns (N, k), shape (2 m, k), for derivatives (m, 2, 6)."""
-    return _times_transpose(columns.T, H, rows).T
+def _times(H: Array, columns: Indices, matrix: Array) -> Array:
+    """Return H times a matrix (N, k), shape (2 m, k), for derivatives (m, 2, 6)."""
+    return _times_transpose(matrix.T, H, columns).T
