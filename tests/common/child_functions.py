@@ -16,6 +16,16 @@ def echo(connection, *parts):
         connection.sendall(data)
 
 
+def answer_late(connection):
+    """Answer no request before the second one has come, then each by itself."""
+    report_ready(connection)
+    lines = connection.recv(1024)
+    while lines.count(b"\n") < 2:
+        lines += connection.recv(1024)
+    connection.sendall(lines)
+    connection.recv(1)
+
+
 def refuse(connection):
     raise ProcessStartError("no robot\nis connected")
 

@@ -11,7 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.common.child_functions import accept, compute_in_c, echo, exit_with, fail, refuse, sleep, terminated
+from tests.common.child_functions import (
+    accept,
+    answer_late,
+    compute_in_c,
+    echo,
+    exit_with,
+    fail,
+    refuse,
+    sleep,
+    terminated,
+)
 from vtbdrake.common.child_process import ChildProcess, ProcessStartError, ending_signals
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,6 +60,15 @@ def test_requests_are_answered_line_by_line():
     child.kill()
     with pytest.raises(OSError):
         child.request(b"c\n", timeout=60.0)
+    child.close()
+
+
+def test_answer_that_comes_too_late_is_passed_over():
+    child = ChildProcess(answer_late, name="the thinker")
+    child.wait_until_ready()
+    with pytest.raises(TimeoutError):
+        child.request(b"first\n", timeout=0.01)
+    assert child.request(b"second\n", timeout=60.0) == b"second\n"
     child.close()
 
 

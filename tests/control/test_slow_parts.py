@@ -4,6 +4,7 @@ import os
 import signal
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +18,13 @@ from tests.control.scripted import PERIOD, ScriptedBridge
 from tests.control.slow import SlowScenario, busy, chaotic, deadly, gated, moving, picky, processes
 from vtbdrake.common.child_process import ProcessStartError
 from vtbdrake.common.frames import pack, unpack
+from vtbdrake.control import slow_parts
+from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.stepping import ChangeKind
+from vtbdrake.control.supervisor import SupervisorMessage
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
@@ -251,6 +255,35 @@ def test_slow_part_that_does_not_start_is_an_error(prepare, reason):
         pytest.raises(ProcessStartError, match=rf"the slow part dps\.perception does not start: .*{reason}"),
     ):
         runtime.slow_parts.wait_until_ready(0.5 if prepare is signal.pause else TIMEOUT)
+
+
+def test_slow_parts_share_a_time_out(monkeypatch):
+    builder = DiagramBuilder()
+    for name in ("left", "right"):
+        part = SlowPart(processes, inputs={"position": 1}, outputs={"estimate": 2}, period=0.1, latency=0.05)
+        builder.ExportInput(builder.AddNamedSystem(name, part).get_input_port(), name)
+    diagram = builder.Build()
+    parts = {name: diagram.GetSubsystemByName(name) for name in ("left", "right")}
+    now, ready = [0.0], (SupervisorMessage.READY, None)
+    answers = [(5.0, []), (5.0, []), (4.0, [ready]), (5.0, [])]  # Each in a time, if it is waited for as long.
+
+    def answered(process, timeout):
+        takes, messages = answers.pop(0)
+        now[0] += min(takes, timeout)
+        return messages
+
+    monkeypatch.setattr(BackgroundProcess, "wait_for_messages", answered)
+    monkeypatch.setattr(slow_parts, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    context = diagram.CreateDefaultContext()
+    served = SlowParts(parts, context, period=0.01, clock=SimulatedClock(), changed=lambda *_: None)
+    try:
+        assert not served.wait(5.0) and now == [5.0]
+        with pytest.raises(ProcessStartError, match="the slow part right .* not ready within 5 s"):
+            served.wait_until_ready(5.0)
+        assert now == [10.0]
+    finally:
+        monkeypatch.undo()
+        served.close()
 
 
 def test_no_process_is_left():

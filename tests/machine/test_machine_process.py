@@ -333,6 +333,15 @@ def test_requests_over_lcm(hub: Hub) -> None:
         assert process.wait() == DIED
 
 
+def test_wait_for_a_status_keeps_its_timeout_when_the_machine_is_frozen(hub: Hub) -> None:
+    with MachineProcess(RobotScenario(), hub.url) as process:
+        process.pause()
+        with pytest.raises(MachineError, match=r"does not answer within 0.2 s: it is stopped, or hangs"):
+            process.until(lambda status: True, timeout=0.2)
+        process.resume()
+        assert process.statistics().lost >= 0.0  # The late answer was a status.
+
+
 # -- its end
 
 

@@ -178,7 +178,6 @@ class ModelRefit(Closing):
             Whether there is nothing to wait for any more; the answer is taken in the next cycles.
         """
         if self._posted:
-            self._worker.drain(timeout)
             self._answers += self._worker.wait_for_messages(timeout)
         return bool(self._answers) or not (self._posted and self._worker.alive)
 

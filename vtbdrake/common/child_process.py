@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import PathFinder
@@ -26,7 +27,9 @@ from vtbdrake.common.quick_exit import quick_exit
 
 _log = logging.getLogger(__name__)
 
-_ANSWER_TIMEOUT = 10.0  # s for a service to answer, and to end
+ANSWER_TIMEOUT = 10.0
+"""Time for a service to answer, and to end, in seconds."""
+
 _MAX_LOG = 1000  # log messages that wait to be written; further ones are dropped
 
 # What a terminal, systemd or `timeout` sends to all processes of a group.
@@ -103,6 +106,8 @@ class ChildProcess:
         from vtbdrake.common.pickling import dumps  # Here, because `import vtbdrake` should stay quick.
 
         self.name = name
+        self._unanswered = 0  # the number of requests whose answers have not been read
+        self._received = b""  # of answers
         self.connection, child_end = socket.socketpair()
         # A file, because a socket takes only so much before the child reads from it.
         with child_end, tempfile.TemporaryFile() as call:
@@ -144,7 +149,7 @@ class ChildProcess:
             ProcessStartError: The child has ended, with the reason if it raised this error; or it is late.
         """
         try:
-            reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: the rest is left to other readers.
+            reason = self._read_reason(timeout).decode().strip()
         except BaseException as error:
             self.kill()
             self.connection.close()
@@ -161,30 +166,49 @@ class ChildProcess:
             self.close()
             raise ProcessStartError(reason)
 
+    def _read_reason(self, timeout: float | None) -> bytes:
+        self.connection.settimeout(timeout)
+        line = b""
+        while not line.endswith(b"\n"):
+            line += self._receive(1)  # Byte by byte: the rest is left to other readers.
+        self.connection.settimeout(None)
+        return line
+
     def request(self, line: bytes, *, timeout: float) -> bytes:
         """Send a line to the child, and return the line that it answers.
+
+        An answer that came too late for an earlier request is passed over.
 
         Args:
             line: The request, ending with a newline.
             timeout: How long to wait for the answer, in s.
 
         Raises:
-            OSError: The child has ended, or does not answer within ``timeout`` seconds.
+            TimeoutError: The child does not answer within ``timeout`` seconds.
+            OSError: The child has ended.
         """
+        deadline = time.monotonic() + timeout
         self.connection.settimeout(timeout)
         self.connection.sendall(line)
-        return self._read_line(timeout, 65536)
-
-    def _read_line(self, timeout: float | None, size: int) -> bytes:
-        self.connection.settimeout(timeout)
-        line = b""
-        while not line.endswith(b"\n"):
-            part = self.connection.recv(size)
-            if not part:
-                raise ConnectionResetError("its process has ended")
-            line += part
+        self._unanswered += 1
+        answer = b""
+        while self._unanswered:
+            while b"\n" not in self._received:
+                left = deadline - time.monotonic()
+                if left <= 0.0:
+                    raise TimeoutError(f"no answer within {timeout:g} s")
+                self.connection.settimeout(left)
+                self._received += self._receive(65536)
+            answer, _, self._received = self._received.partition(b"\n")
+            self._unanswered -= 1
         self.connection.settimeout(None)
-        return line
+        return answer + b"\n"
+
+    def _receive(self, size: int) -> bytes:
+        part = self.connection.recv(size)
+        if not part:
+            raise ConnectionResetError("its process has ended")
+        return part
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait until the child has ended, and return its exit code.
@@ -245,11 +269,16 @@ class ChildService:
             raise self.error(f"{self.name} is not running: start it, or use it in a with statement")
         return self._child
 
-    def _request(self, line: bytes) -> bytes:
+    def _request(self, line: bytes, *, timeout: float = ANSWER_TIMEOUT) -> bytes:
+        child = self._running()
         try:
-            return self._running().request(line, timeout=_ANSWER_TIMEOUT)
+            return child.request(line, timeout=timeout)
+        except TimeoutError as error:
+            raise self.error(
+                f"{self.name} (process {child.pid}) does not answer within {timeout:.3g} s: it is stopped, or hangs"
+            ) from error
         except OSError as error:
-            raise self.error(f"{self.name} does not answer: {error}") from error
+            raise self.error(f"{self.name} does not answer: its process has ended ({error})") from error
 
     @property
     def pid(self) -> int:
@@ -259,7 +288,7 @@ class ChildService:
     def close(self) -> None:
         """End the service; it can be started again."""
         if self._child is not None:
-            self._child.close(_ANSWER_TIMEOUT)
+            self._child.close(ANSWER_TIMEOUT)
         self._child = None
 
     def __enter__(self) -> Self:

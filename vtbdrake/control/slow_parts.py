@@ -125,8 +125,9 @@ class SlowParts:
         Raises:
             ProcessStartError: One has ended, or is not ready within ``timeout`` seconds.
         """
+        end = time.monotonic() + timeout
         for part in self._parts:
-            part.wait_until_ready(timeout)
+            part.wait_until_ready(end, timeout)
 
     def wait(self, timeout: float) -> bool:
         """Wait until every worker has an answer, or is ready for its first request.
@@ -136,7 +137,8 @@ class SlowParts:
         Returns:
             False if one has no answer within ``timeout`` seconds.
         """
-        return all([part.wait(timeout) for part in self._parts])
+        end = time.monotonic() + timeout
+        return all([part.wait(max(0.0, end - time.monotonic())) for part in self._parts])
 
     def close(self) -> None:
         """End all processes."""
@@ -242,8 +244,9 @@ class _Part:
             if not self._supervisor.post((self._requested, arrays)):
                 _log.error("the slow part %s: its processes have ended, and all results will be missing", self.path)
 
-    def wait_until_ready(self, timeout: float) -> None:
-        end, restarts = time.monotonic() + timeout, self.statistics.restarts
+    def wait_until_ready(self, end: float, timeout: float) -> None:
+        """Wait until a time by `time.monotonic`, which is the end of a time-out; both are in seconds."""
+        restarts = self.statistics.restarts
         while not self._ready:
             answers = self._supervisor.wait_for_messages(max(0.0, end - time.monotonic()))
             for answer in answers:

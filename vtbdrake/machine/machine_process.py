@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.common.child_process import ChildService, ProcessStartError, report_ready
+from vtbdrake.common.child_process import ANSWER_TIMEOUT, ChildService, ProcessStartError, report_ready
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.machine.config import MachineConfig
@@ -23,6 +23,9 @@ from vtbdrake.machine.injected_faults import InjectedFault
 from vtbdrake.machine.machine import Machine, MachineStatus
 from vtbdrake.machine.machine_loop import MachineLoop, epoch, serve
 from vtbdrake.testbed import Scenario
+
+_LEAST_TIMEOUT = 0.1
+"""Time for an answer where hardly any is left, in seconds: requests are answered between two cycles."""
 
 
 class MachineError(RuntimeError):
@@ -131,11 +134,12 @@ class MachineProcess(ChildService):
             timeout: Longest wait, in s.
 
         Raises:
-            MachineError: There was none within ``timeout`` seconds.
+            MachineError: There was none within ``timeout`` seconds, or it does not answer.
         """
-        limit = time.monotonic() + timeout
-        while not condition(status := self.status()):
-            if time.monotonic() > limit:
+        limit, left = time.monotonic() + timeout, timeout
+        while not condition(status := self._status({"request": "status"}, timeout=left)):
+            left = limit - time.monotonic()
+            if left <= 0.0:
                 raise MachineError(f"the machine did not reach the expected status within {timeout} s; it has {status}")
         return status
 
@@ -199,12 +203,13 @@ class MachineProcess(ChildService):
 
     # -- requests
 
-    def _status(self, request: dict[str, Any]) -> MachineStatus:
-        answer = self._ask(request)
+    def _status(self, request: dict[str, Any], *, timeout: float = ANSWER_TIMEOUT) -> MachineStatus:
+        answer = self._ask(request, timeout=timeout)
         return MachineStatus(**{item.name: answer[item.name] for item in fields(MachineStatus)})
 
-    def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = json.loads(self._request(_to_line(request)))
+    def _ask(self, request: dict[str, Any], *, timeout: float = ANSWER_TIMEOUT) -> dict[str, Any]:
+        timeout = min(max(timeout, _LEAST_TIMEOUT), ANSWER_TIMEOUT)
+        answer: dict[str, Any] = json.loads(self._request(_to_line(request), timeout=timeout))
         if "error" in answer:
             raise MachineError(answer["error"])
         return answer

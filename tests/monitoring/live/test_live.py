@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import lcm
@@ -23,6 +24,7 @@ from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
+from vtbdrake.monitoring.live import client as client_module
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError, LiveWatch, watch
 from vtbdrake.monitoring.live.live_server import MAX_WAITING
 from vtbdrake.monitoring.live.service import loop_status
@@ -423,6 +425,41 @@ def test_watch_period_beyond_timeout_is_reported(hub: Hub) -> None:
         rig.during(asked, hub.url, "get", ["dps.gain"])
         told = "or 1000000000 cycles take longer"
         assert rig.during(lambda: any(told in reason(timeout) for timeout in LONGER_AND_LONGER))
+
+
+def test_the_time_between_two_values_is_the_callers(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, ahead = time.monotonic, [0.0]
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: real() + ahead[0]))
+
+    def take_long() -> list[float]:
+        taken = []
+        for now, _ in islice(watch(hub.url, ["dps.ticks"], timeout=PATIENCE), 30):
+            taken.append(now)
+            ahead[0] += 10.0 * PATIENCE
+        return taken
+
+    with served(hub.url, **AMPLE) as (rig, _):
+        assert len(rig.during(take_long)) == 30
+
+
+def test_wait_ends_with_its_watch(hub: Hub) -> None:
+    """Also if the thread of the watch still takes its time to end."""
+    released, held = threading.Event(), list[bool]()
+
+    def hold(frame: FrameType, event: str, _: object) -> None:
+        if (event, frame.f_code) == ("return", threading.Thread.run.__code__):
+            held.append(released.wait(20.0))
+
+    threading.setprofile(hold)
+    try:
+        live = LiveWatch(hub.url, ["dps.ticks"], timeout=0.1)
+    finally:
+        threading.setprofile(None)
+    with pytest.raises(LiveTimeoutError, match="no answer on"):
+        live.wait(1, timeout=30.0)
+    released.set()
+    live.close()
+    assert held == [True]
 
 
 def test_watch_ends_with_its_lease(hub: Hub) -> None:

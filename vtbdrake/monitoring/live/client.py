@@ -182,7 +182,7 @@ def watch(
         addresses: Addresses of variables and output ports.
         every: Period in cycles; fewer values come if the loop lacks the time to read all watched values.
         lease: Lease in seconds, which is renewed during the iteration.
-        timeout: Seconds without a value after which an error is raised.
+        timeout: Seconds without a value after which an error is raised, without the time between two iterations.
 
     Yields:
         The DPS's time in seconds, and the values by address. Where the loop lacks the time to read all of them in one
@@ -233,6 +233,7 @@ def _samples(
                 begun = True
                 if "values" in message:
                     yield _sample(message, addresses)
+                    last = time.monotonic()  # The caller may have taken long: values wait meanwhile.
             if time.monotonic() >= last + timeout:
                 if begun and link.connected:
                     raise LiveTimeoutError(
@@ -285,6 +286,7 @@ class LiveWatch(Closing):
         self._addresses = tuple(addresses)
         self._samples: deque[tuple[float, float, Values]] = deque(maxlen=size)
         self._error: Exception | None = None
+        self._ended = False
         self._stop = threading.Event()
         self._grown = threading.Condition()
         self._count = 0
@@ -302,6 +304,7 @@ class LiveWatch(Closing):
         except (LiveError, LiveTimeoutError, BridgeError) as error:
             self._error = error
         with self._grown:
+            self._ended = True
             self._grown.notify_all()
 
     @property
@@ -322,7 +325,7 @@ class LiveWatch(Closing):
             BridgeError: There is no bus.
         """
         with self._grown:
-            arrived = self._grown.wait_for(lambda: self._count >= count or not self._thread.is_alive(), timeout)
+            arrived = self._grown.wait_for(lambda: self._count >= count or self._ended, timeout)
         self._check()
         if not arrived or self._count < count:
             raise LiveTimeoutError(f"{self._count} of {count} samples came within {timeout} s")
