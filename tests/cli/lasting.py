@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import Context, LeafSystem
 
+from tests.control.servo_machine import ServoMachineScenario
 from tests.testbeds import PendulumScenario
 from vtbdrake.testbed import VirtualTestbedBuilder
 
@@ -40,6 +41,15 @@ class _Lasting(LeafSystem):
 @dataclass
 class StepScenario(PendulumScenario):
     """Its first step is computed for ever."""
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        builder.add("sys", "lasting", _Lasting())
+
+
+@dataclass
+class StepMachineScenario(ServoMachineScenario):
+    """The first step of its machine is computed for ever."""
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         super().add_world(builder)

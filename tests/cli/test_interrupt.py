@@ -41,6 +41,7 @@ IMPORT, BUILD, STEP = (
 IMPORTING = "it is being imported"
 SERVO = "tests.control.scripted:ServoScenario"
 MACHINE = "tests.control.servo_machine:ServoMachineScenario"
+STEP_MACHINE = "tests.cli.lasting:StepMachineScenario"
 TRUST = ("--trust", "tests")
 # States that no line tells: a client has connected to the hub; a C compiler has been started.
 CONNECTED = "connected"
@@ -133,15 +134,17 @@ def places(tmp_path: Path) -> Iterator[Places]:
         yield made
 
 
-def case(name: str, *arguments: object, until: str, code: int = 1, marks: Any = ()) -> Any:
-    """Return a row: a command, the line that tells its state, and its exit code after Ctrl-C."""
-    return pytest.param(arguments, until, code, id=name, marks=marks)
+def case(
+    name: str, *arguments: object, until: str, code: int = 1, number: int = signal.SIGINT, marks: Any = ()
+) -> Any:
+    """Return a row: a command, the line that tells its state, a signal, and its exit code after that."""
+    return pytest.param(arguments, until, number, code, id=name, marks=marks)
 
 
 @pytest.mark.slow_cases
 @pytest.mark.one_python
 @pytest.mark.parametrize(
-    ("arguments", "until", "code"),
+    ("arguments", "until", "number", "code"),
     [
         # A testbed is looked at.
         case("variables, importing", "variables", IMPORT, until=IMPORTING),
@@ -159,6 +162,7 @@ def case(name: str, *arguments: object, until: str, code: int = 1, marks: Any = 
         case("view, building", "view", BUILD, PAGE, until=BUILDING, marks=slow),
         case("view, serving", "view", PENDULUM, PAGE, until=URL, code=0, marks=slow),
         case("view, stepping", "view", STEP, PAGE, "--play", until=STEPPING, code=0),
+        case("view, told to end", "view", STEP, PAGE, "--play", until=STEPPING, number=signal.SIGTERM, code=0),
         case("view, loop", "view", PENDULUM, PAGE, "--url", "{hub}", until=URL, code=0, marks=slow),
         case("view, log", "view", SERVO, PAGE, "--log", "{log}", until=URL, code=0, marks=slow),
         case("study open", "study", "open", "{study}", PAGE, *TRUST, until=URL, code=0, marks=slow),
@@ -168,12 +172,16 @@ def case(name: str, *arguments: object, until: str, code: int = 1, marks: Any = 
         case("hub", "hub", "--port", 0, until="tcpq", code=0),
         case("machine, importing", "machine", IMPORT, "--url", "{hub}", until=IMPORTING, marks=slow),
         case("machine, running", "machine", MACHINE, "--url", "{hub}", until="ready", code=0, marks=slow),
+        case("machine, stepping", "machine", STEP_MACHINE, "--url", "{hub}", until=STEPPING),
+        case("machine, told to end", "machine", STEP_MACHINE, "--url", "{hub}", until=STEPPING, number=signal.SIGTERM),
         case("run, waiting", "run", MACHINE, "--url", "{hub}", "--priority", 0, until="switch interval", code=0),
         case("watch, waiting", "watch", "--url", "{hub}", "a", "--timeout", 600, until=CONNECTED, code=0),
         case("get, waiting", "get", "--url", "{hub}", "a", "--timeout", 600, until=CONNECTED, marks=slow),
     ],
 )
-def test_one_ctrl_c_ends_a_command(arguments: tuple[object, ...], until: str, code: int, places: Places) -> None:
+def test_one_ctrl_c_ends_a_command(
+    arguments: tuple[object, ...], until: str, number: int, code: int, places: Places
+) -> None:
     words = [places.filled(word) for word in arguments]
     command = [sys.executable, "-u", "-m", "vtbdrake.cli", *words]
     with subprocess.Popen(
@@ -198,7 +206,7 @@ def test_one_ctrl_c_ends_a_command(arguments: tuple[object, ...], until: str, co
                     assert line, f"it has ended before: {seen}"
                     seen += line
             killer.cancel()
-            os.killpg(process.pid, signal.SIGINT)  # As a terminal does.
+            os.killpg(process.pid, number)  # As a terminal does.
             output, _ = process.communicate(timeout=BOUND)
         finally:
             killer.cancel()

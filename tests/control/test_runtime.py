@@ -976,6 +976,15 @@ def test_cancelled_request_is_left_out():
     assert served.done() and done == ["served"]
 
 
+def test_requests_that_no_cycle_serves_are_cancelled_when_the_runtime_is_closed():
+    runtime, _, _ = switched()
+    done = []
+    before = runtime.request(lambda: done.append("before"))
+    runtime.close()
+    after = runtime.request(lambda: done.append("after"))
+    assert before.cancelled() and after.cancelled() and not done
+
+
 def test_first_command_after_outage_departs_from_measurement():
     machine = {**still(0.0), "speed": [0.0, 0.0]}
     runtime, bridge, _ = switched(rate=2.0, sensors=lambda t: machine)

@@ -19,7 +19,7 @@ from vtbdrake.cli.options import (
     url_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show
-from vtbdrake.common.interrupt import ends_by_itself
+from vtbdrake.common.interrupt import interrupt_taken
 from vtbdrake.machine.config import BRAKES, MachineConfig
 
 if TYPE_CHECKING:
@@ -117,7 +117,6 @@ def machine(
     for address, value in simulated.perturbed.items():
         say(f"{address} = {value}")
     loop = MachineLoop(simulated, url)
-    ends_by_itself()
     serve(
         loop,
         lock_step=lock_step,
@@ -125,6 +124,7 @@ def machine(
         priority=priority,
         ready=lambda: show(f"ready on {url}", {"url": url, "perturbed": simulated.perturbed}),
     )
+    interrupt_taken()
     say(loop.statistics)
     say(f"{number(simulated.time)} s simulated, {number(loop.lost)} s behind the clock")
     emit({"simulated": simulated.time, "lost": loop.lost, "statistics": loop.statistics.to_dict()})

@@ -1,9 +1,9 @@
-"""Threads that end the process some time after Ctrl-C, or after its parent's end, whatever it computes or waits for.
+"""Threads that end the process some time after Ctrl-C, SIGTERM or SIGHUP, or after its parent's end, whatever it computes or waits for.
 
 They need no interpreter: code in C or C++ may hold Python's lock all the time, or have dropped the KeyboardInterrupt.
 """
 
-from libc.signal cimport SIGINT
+from libc.signal cimport SIGINT, SIGTERM
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, nanosleep, timespec
 from posix.unistd cimport _exit, read, write
 
@@ -11,6 +11,9 @@ cdef extern from "pthread.h" nogil:
     ctypedef unsigned long pthread_t
     int pthread_create(pthread_t* thread, void* attributes, void* (*start)(void*) noexcept nogil, void* argument)
     int pthread_detach(pthread_t thread)
+
+cdef extern from "signal.h" nogil:
+    int SIGHUP
 
 cdef extern from "poll.h" nogil:
     struct pollfd:
@@ -39,7 +42,7 @@ cdef void* _guard(void* _) noexcept nogil:
     cdef const char* message = b"Aborted!\n"
     turn.tv_sec, turn.tv_nsec = 0, 20_000_000
     while read(_descriptor, &number, 1) == 1:
-        if number != SIGINT:
+        if number not in (SIGINT, SIGTERM, SIGHUP):
             continue
         released, begin = _released, _now()
         while released == _released:
@@ -95,7 +98,7 @@ def start(descriptor: int, time: float, code: int) -> None:
 
     Args:
         descriptor: The end of a pipe from which the numbers of signals are read, see `signal.set_wakeup_fd`.
-        time: The time that the process may take after a SIGINT, in s.
+        time: The time that the process may take after a SIGINT, SIGTERM or SIGHUP that it handles, in s.
         code: The exit code of the process; with another than 0, ``Aborted!`` is printed.
 
     Raises:
@@ -113,6 +116,6 @@ def set_code(code: int) -> None:
 
 
 def release() -> None:
-    """Let the process go on: what was interrupted ends in its own way. The next SIGINT counts anew."""
+    """Let the process go on: what was interrupted ends in its own way. The next signal counts anew."""
     global _released
     _released += 1

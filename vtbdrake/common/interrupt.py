@@ -157,8 +157,9 @@ def end_at_interrupt(code: int) -> None:
     """Let one Ctrl-C end this process within 3 s, whatever it does; for the main thread of a program.
 
     Ctrl-C raises KeyboardInterrupt, as always. Where that is not enough (a call of C++ that lasts, an exception that
-    got lost, a thread that is waited for) the process ends without further ado; its child processes end with it. A
-    program that is started with SIGINT ignored goes on ignoring it.
+    got lost, a thread that is waited for) the process ends without further ado; its child processes end with it. So it
+    does after SIGTERM and SIGHUP, where they have a handler; else they end it at once. A program that is started with
+    SIGINT ignored goes on ignoring it.
 
     Args:
         code: The exit code of such an end.

@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from math import inf, isnan
 from typing import Any
@@ -148,6 +148,7 @@ class Runtime(Closing, Stepped):
         self._left = -1  # The number of cycles after which the loop left.
         self._watchers = list(watchers)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._is_closed = False
         self._stop = threading.Event()
         self._interruptible = Interruptible()
         self._runner: threading.Thread | None = None  # that is in `run`
@@ -178,7 +179,12 @@ class Runtime(Closing, Stepped):
         )
 
     def close(self) -> None:
-        """End the processes of the slow parts. Nothing can be done with the runtime afterwards."""
+        """End the processes of the slow parts. Nothing can be done with the runtime afterwards.
+
+        Requests that no cycle has served are cancelled.
+        """
+        self._is_closed = True
+        self._cancel_requests()
         self.slow_parts.close()
 
     # -- the loop
@@ -514,11 +520,19 @@ class Runtime(Closing, Stepped):
     def request(self, action: Callable[[], Any]) -> Future[Any]:
         """Call ``action`` (a `switch`, a `write`) at the beginning of the next cycle. May be called from any thread.
 
-        A change of the context by other means than the runtime's methods is not recorded: a replay would lack it.
+        A change of the context by other means than the runtime's methods is not recorded: a replay would lack it. When
+        the runtime is closed before the next cycle, the future is cancelled.
         """
         future: Future[Any] = Future()
         self._requests.append((action, future))
+        if self._is_closed:
+            self._cancel_requests()
         return future
+
+    def _cancel_requests(self) -> None:
+        with suppress(IndexError):  # Two threads may do so.
+            while True:
+                self._requests.popleft()[1].cancel()
 
     def _serve(self) -> None:
         if not self._requests:

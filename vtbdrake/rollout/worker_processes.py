@@ -257,7 +257,7 @@ class ProcessExecutor(Executor):
                 else:
                     yield self._finish(worker, frame, call)
         except (EOFError, OSError):
-            yield _Lost(worker, worker.jobs[0], f"its worker process died (exit code {worker.child.wait()})")
+            yield _Lost(worker, worker.jobs[0], f"its worker process died (exit code {worker.child.close()})")
 
     def _finish(self, worker: _Worker, frame: bytes, call: _Call) -> _Reply:
         """Return the outcome of a worker's rollout; it goes on with the next one that it was given."""

@@ -6,9 +6,11 @@ import asyncio
 import json
 import random
 import socket as socketlib
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import pytest
 import uvicorn
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import Context, LeafSystem
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
@@ -26,17 +29,41 @@ from websockets.http11 import Response
 from websockets.sync.client import ClientConnection, connect
 from websockets.uri import parse_uri
 
+from tests.testbeds import PendulumScenario
 from tests.web.live.test_drive import LimitedPendulumScenario, problem
 from tests.web.serving.entrance import entered
 from vtbdrake.state.multibody import multibody_variables
+from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake.web import View, view
 from vtbdrake.web.live.watching import describe
+from vtbdrake.web.serving import requests as requests_module
 from vtbdrake.web.serving.host import Host, PortError
 from vtbdrake.web.serving.relay import Newest, relay
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 ANGLE = "sim.sys.cart_pole.pole_pin.position"
 PATIENCE = 60.0
+
+
+class Hanging(LeafSystem):
+    """Hangs in the first step, until it is told to end."""
+
+    begun, ended = threading.Event(), threading.Event()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclarePeriodicPublishEvent(1e-3, 1e-3, self._hang)
+
+    def _hang(self, context: Context) -> None:
+        self.begun.set()
+        self.ended.wait()
+
+
+@dataclass
+class HangingScenario(PendulumScenario):
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        builder.add("sys", "hanging", Hanging())
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +115,30 @@ def test_only_who_has_a_ticket_gets_the_page(running: View) -> None:
         assert status == 403 and "open an address that vtbdrake has printed" in text
     status, text, _ = ask(base(running))
     assert status == 200 and "viewer" not in text  # the entrance
+
+
+def test_page_of_a_simulation_that_hangs_can_be_closed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(requests_module, "LONGEST_END", 0.5)
+    Hanging.begun.clear()
+    Hanging.ended.clear()
+    release = threading.Timer(30.0, Hanging.ended.set)
+    opened = view(HangingScenario())
+    # It is loaded, so that its threads are those of the program.
+    threads = [thread for thread in threading.enumerate() if thread.name.startswith("vtbdrake")]
+    with page(opened) as socket:
+        socket.send(json.dumps({"id": 1, "do": "step"}))
+        assert Hanging.begun.wait(PATIENCE)
+        release.start()
+        opened.close()
+        assert not Hanging.ended.is_set()
+    for part in ("the page's server", "the session's simulation"):
+        assert f"{part} does not end within 0.5 s" in caplog.text
+    release.cancel()
+    Hanging.ended.set()
+    for thread in threads:
+        thread.join(PATIENCE)
 
 
 def test_foreign_host_and_foreign_origin_are_refused(running: View) -> None:

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from vtbdrake.web.serving.requests import Requests
+from vtbdrake.web.serving import requests as requests_module
+from vtbdrake.web.serving.requests import Requests, wait_for_end
 
 
 class EndedError(RuntimeError):
@@ -86,3 +87,22 @@ def test_without_requests_the_thread_goes_on_after_its_patience() -> None:
     answers = [asked.tell(lambda number=number: number) for number in range(3)]
     assert asked.carry_out(0.0)
     assert [answer.result(0.0) for answer in answers] == [0, 1, 2]
+
+
+def test_a_thread_that_hangs_is_left_behind(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(requests_module, "LONGEST_END", 0.01)
+    hangs = threading.Event()
+    thread = threading.Thread(target=hangs.wait)
+    thread.start()
+    wait_for_end(thread, "the worker")
+    hangs.set()
+    thread.join()
+    assert "the worker does not end within 0.01 s: its thread is left behind" in caplog.text
+
+
+def test_what_a_thread_begins_meanwhile_is_ended_too(caplog: pytest.LogCaptureFixture) -> None:
+    ends = threading.Semaphore(0)
+    thread = threading.Thread(target=lambda: [ends.acquire(timeout=60.0) for _ in range(2)])
+    thread.start()
+    wait_for_end(thread, "the worker", end=ends.release)
+    assert not thread.is_alive() and not caplog.text

@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,10 @@ from tests.web.serving.entrance import entered
 from tests.web.study.studies import ANGLE, HORIZON, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from vtbdrake.optimization import Choice, Parameter, Study, StudyError
 from vtbdrake.optimization.importance import importances
-from vtbdrake.rollout import Quality
+from vtbdrake.rollout import Quality, RolloutResult, RolloutTask
+from vtbdrake.rollout.executor import SerialExecutor, WorkerError
 from vtbdrake.web import StudyView, view_study
+from vtbdrake.web.study import study_worker
 from vtbdrake.web.study.study_worker import PointError, PointSimulator
 
 pytestmark = pytest.mark.one_python
@@ -469,6 +472,43 @@ def test_driven_trial_is_shown_by_its_course(tmp_path: Path) -> None:
         while len(reader.status["driven"]["numbers"]) < 2:
             reader.read()
         assert "the code has changed since" in reader.ask("show", role="pointed", driven=2)["message"]
+
+
+class Tardy:
+    """An executor that is closed just before its next rollout begins."""
+
+    started, closed, closed_again = (threading.Event() for _ in range(3))
+
+    def __init__(self, workers: int) -> None:
+        self._serial = SerialExecutor()
+
+    def start_workers(self, rollouts: int) -> None:
+        pass
+
+    def run(self, task: RolloutTask, points: Any) -> Iterator[tuple[int, RolloutResult]]:
+        self.started.set()
+        if not self.closed.is_set():
+            self.closed.wait(PATIENCE)
+            yield from self._serial.run(task, points)
+        else:
+            self.closed_again.wait(PATIENCE)
+            raise WorkerError("the executor was closed")
+
+    def close(self) -> None:
+        (self.closed_again if self.closed.is_set() else self.closed).set()
+
+
+@pytest.mark.slow
+def test_end_between_two_rollouts_of_a_point_ends_the_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_worker, "ProcessExecutor", Tardy)
+    simulator = PointSimulator(cart_pole_problem(conditions=[{}, {PLACE: 0.1}]))
+    with ThreadPoolExecutor(1) as pool:
+        attempt = pool.submit(simulator.attempt, (1.0, 0.0))
+        assert Tardy.started.wait(PATIENCE)
+        simulator.close()
+        assert Tardy.closed_again.is_set()
+        with pytest.raises(PointError, match="the executor was closed"):
+            attempt.result(PATIENCE)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from vtbdrake.common.closing import Closing
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.drake_workarounds.kept_meshcats import DEATH, abandon_if_dead
 from vtbdrake.drake_workarounds.renderer_threads import release_renderers
-from vtbdrake.web.serving.requests import Requests
+from vtbdrake.web.serving.requests import Requests, wait_for_end
 
 if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
@@ -196,9 +196,9 @@ class Session(Closing, ABC, Generic[_Stage]):
         ready.result()
 
     def close(self) -> None:
-        """End the session and its Meshcat."""
+        """End the session and its Meshcat; a simulation that hangs is left behind after 10 s."""
         self._commands.end()
-        self._thread.join()
+        wait_for_end(self._thread, "the session's simulation")
 
     # -- commands
 

@@ -30,6 +30,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.web.serving.access import Access
 from vtbdrake.web.serving.relay import moves_camera, relay
+from vtbdrake.web.serving.requests import wait_for_end
 from vtbdrake.web.serving.tls import Tls
 from vtbdrake.web.serving.web_page import check_host
 
@@ -147,11 +148,11 @@ class Host:
         return f"{self._access.framed_session()}/"
 
     def close(self) -> None:
-        """End the server and all its connections."""
+        """End the server and all its connections; one whose command hangs is left behind after 10 s."""
         self._server.should_exit = True
         for task in tuple(self._server.server_state.tasks):  # Browsers do not end them by themselves.
             task.get_loop().call_soon_threadsafe(task.cancel)
-        self._thread.join()
+        wait_for_end(self._thread, "the page's server")
         self._socket.close()
 
     async def _serve_socket(self, browser: WebSocket) -> None:

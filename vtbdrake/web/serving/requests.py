@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from queue import Empty, SimpleQueue
@@ -10,9 +12,33 @@ from typing import TypeVar
 
 from vtbdrake.common.failures import FAILURES
 
+_log = logging.getLogger(__name__)
+
 _Result = TypeVar("_Result")
 
+LONGEST_END = 10.0
+"""Time to wait for the end of a thread that is busy, in seconds."""
+
 _PERIOD = 0.5  # s between two looks at whether the thread is alive
+
+
+def wait_for_end(thread: Thread, name: str, *, end: Callable[[], object] = lambda: None) -> None:
+    """Wait until a thread has ended, for 10 s at most: a daemon thread that hangs is left behind, which is logged.
+
+    Args:
+        thread: The thread, which has been told to end.
+        name: What the log calls it, such as "the page's server".
+        end: Called again and again while the thread runs, to end what it has begun meanwhile.
+    """
+    limit = time.monotonic() + LONGEST_END
+    while thread.is_alive() and (left := limit - time.monotonic()) > 0.0:
+        end()
+        thread.join(min(left, _PERIOD))
+    if thread.is_alive():
+        _log.error(
+            "%s does not end within %g s: its thread is left behind, and may keep a core busy until the program ends",
+            *(name, LONGEST_END),
+        )
 
 
 class Requests:

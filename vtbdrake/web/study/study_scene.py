@@ -19,7 +19,7 @@ from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
 from vtbdrake.visualization.viewpoint import fitting_camera
-from vtbdrake.web.serving.requests import Requests
+from vtbdrake.web.serving.requests import Requests, wait_for_end
 from vtbdrake.web.study.study_worker import PointError, PointRollout
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class StudyScene:
     def close(self) -> None:
         """End the scene and its Meshcat."""
         self._commands.end()
-        self._thread.join()
+        wait_for_end(self._thread, "the study's picture")
 
     def show(self, role: str, rollout: PointRollout | None) -> None:
         """Show a rollout in a role, a key of `TINTS`; None removes what is there.

@@ -19,6 +19,7 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 from vtbdrake.testbed import Scenario
+from vtbdrake.web.serving.requests import wait_for_end
 
 _Kind = TypeVar("_Kind")
 
@@ -100,8 +101,9 @@ class PointSimulator:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._executor.close()  # This ends a rollout under way, too.
-        self._thread.join()
+        # Closing ends a rollout under way, too; another condition's may begin just then.
+        wait_for_end(self._thread, "the simulation of a point", end=self._executor.close)
+        self._executor.close()
 
     def rollout(self, point: Point, *, condition: int, role: str = "pointed") -> PointRollout:
         """Return the rollout of a point under a condition, computed if it is not kept.

@@ -26,7 +26,7 @@ from vtbdrake.monitoring.live.client import LiveClient, LiveTimeoutError
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.hand_command import HandCommand
 from vtbdrake.web.serving.host import CLOSED, action_of, command_of, first_of, receive, send
-from vtbdrake.web.serving.requests import Requests
+from vtbdrake.web.serving.requests import Requests, wait_for_end
 from vtbdrake.web.vr.hand import HandError, HandMessage, Lead
 
 _TICK = 0.01  # s, between two commands while a hand leads
@@ -224,9 +224,9 @@ class VirtualReality:
         self._thread.start()
 
     def close(self) -> None:
-        """Release the robot, and end."""
+        """Release the robot, and end; a robot that hangs is left behind after 10 s."""
         self._inbox.end()
-        self._thread.join()
+        wait_for_end(self._thread, "leading the robot")
 
     def arm(self) -> None:
         """Let a headset lead.
