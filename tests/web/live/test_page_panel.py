@@ -57,6 +57,8 @@ def page(shared: Page) -> Page:
 def reload(page: Page) -> None:
     page.reload()
     page.wait_for_selector(READY, state="attached")
+    # The server may still be taking leave of the page before, which steered.
+    page.wait_for_function("!vtb.messages.textContent.includes('another page steers')")
 
 
 def watched(page: Page) -> list[str]:

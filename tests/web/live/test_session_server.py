@@ -10,6 +10,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -88,6 +89,15 @@ def base(running: View) -> str:
 def page(running: View, path: str = "session", headers: dict[str, str] | None = None) -> ClientConnection:
     url = entered(running.url).replace("http", "ws", 1) + path
     return connect(url, additional_headers=headers, max_size=None, open_timeout=PATIENCE)
+
+
+@contextmanager
+def steering(running: View) -> Iterator[ClientConnection]:
+    """Open a page that steers: the server may still be taking leave of the one before."""
+    with page(running) as socket:
+        while not receive(socket, "frame")["steers"]:
+            pass
+        yield socket
 
 
 def receive(socket: ClientConnection, kind: str) -> dict[str, Any]:
@@ -200,6 +210,8 @@ def test_entries_of_a_pose_have_units_of_their_own() -> None:
 def test_page_watches_and_steers(running: View) -> None:
     with page(running) as socket:
         hello = receive(socket, "hello")
+        while not receive(socket, "frame")["steers"]:
+            pass  # The page of an earlier test may not have gone yet.
         assert hello["variables"][ANGLE] == {
             "kind": "x", "shape": [], "unit": "rad", "units": [], "bounds": [[None], [None]], "settable": True,
             "entries": [], "choices": [],
@@ -239,7 +251,7 @@ NO_COMMANDS = [
 def test_frame_that_is_no_command_is_answered_and_closes_nothing(
     running: View, content: str | bytes, expected: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with page(running) as socket:
+    with steering(running) as socket:
         socket.send(content)
         answer = receive(socket, "answer")
         assert answer["error"].startswith(expected) and answer["id"] is None and len(answer["error"]) < 1000
@@ -268,7 +280,7 @@ def test_page_that_drives_and_falls_silent_lets_go() -> None:
 
 
 def test_page_that_only_watches_a_drive_lets_nothing_go(running: View) -> None:
-    with page(running) as socket:
+    with steering(running) as socket:
         assert command(socket, "deflect", deflections={}) == ""  # Nothing is driven.
         with page(running) as other:
             assert command(other, "take over") == ""
@@ -302,8 +314,7 @@ def test_meshcat_that_has_ended_is_told_to_the_browser(monkeypatch: pytest.Monke
 
 
 def test_one_page_steers_and_the_others_watch(running: View) -> None:
-    with page(running) as first:
-        receive(first, "frame")
+    with steering(running) as first:
         with page(running) as second:
             assert command(first, "pause") == ""
             assert command(second, "pause") == "another page steers this session: take over first"
@@ -474,9 +485,7 @@ def test_page_drives_and_a_page_that_is_gone_releases_its_keys(tmp_path: Path) -
             assert command(socket, "step", steps=8) == ""
             assert "1 numbers from -1 to 1" in command(socket, "deflect", deflections={"u.angle": 2.0})
         moved = 0.8 * 8 * running.session.config.step
-        with page(running) as socket:
-            while not receive(socket, "frame")["steers"]:
-                pass
+        with steering(running) as socket:
             assert command(socket, "step", steps=8) == ""
             assert running.session.snapshot()["u.angle"] == pytest.approx(moved)
             socket.send(json.dumps({"id": 2, "do": "end_drive", "keep": True}))
