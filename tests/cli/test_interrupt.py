@@ -134,9 +134,7 @@ def places(tmp_path: Path) -> Iterator[Places]:
         yield made
 
 
-def case(
-    name: str, *arguments: object, until: str, code: int = 1, number: int = signal.SIGINT, marks: Any = ()
-) -> Any:
+def case(name: str, *arguments: object, until: str, code: int = 1, number: int = signal.SIGINT, marks: Any = ()) -> Any:
     """Return a row: a command, the line that tells its state, a signal, and its exit code after that."""
     return pytest.param(arguments, until, number, code, id=name, marks=marks)
 

@@ -14,7 +14,7 @@ from tests.optimization.solvers.driver import CONSTRAINED, ROSENBROCK, SPHERE, d
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import Evaluation, Solver, SolverError, known_solvers, make_solver
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
-from vtbdrake.optimization.solvers.solver import Search
+from vtbdrake.optimization.solvers.solver import Search, ask_within
 
 INSTALLED = [name for name in known_solvers() if name != "GP" or importlib.util.find_spec("torch")]
 # What "bayesian" does is the first that "auto" does.
@@ -286,6 +286,17 @@ def stuck():
 def test_a_method_that_never_returns_is_left_behind_with_a_warning(stuck, caplog):
     stuck.close()
     assert "stuck does not return: its thread is left behind" in caplog.text
+
+
+def test_a_method_that_computes_when_its_time_is_over_is_not_waited_for_as_long(stuck, caplog):
+    stuck.grace, stuck.late_grace = 1e4, 0.01
+    release = threading.Timer(30.0, STUCK.set)
+    release.start()
+    assert ask_within(stuck, 0.01) is None
+    stuck.close()
+    assert not STUCK.is_set() and "stuck does not return: its thread is left behind" in caplog.text
+    release.cancel()
+    release.join()
 
 
 def test_close_releases_a_waiting_caller(stuck):

@@ -32,8 +32,9 @@ class BlockingSolver(Solver):
 
     Method and driver take turns, so that the points asked for do not depend on timing. When the solver is closed
     early, the callback raises `Stopped`, which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and
-    the thread is joined. A method that does not return within `grace` seconds stays behind in its daemon thread. A
-    method that asks `CIRCLES` times in a row for known points only is ended, without success.
+    the thread is joined. A method that does not return within `grace` seconds stays behind in its daemon thread; so
+    does one that is computing when the time of its run is over, after `late_grace` seconds. A method that asks
+    `CIRCLES` times in a row for known points only is ended, without success.
 
     These methods need a number for every point. A failed simulation counts as worse than the worst point so far, by the
     spread of the values so far (at least 1). So does a point without any bound that racing dropped. Points given by
@@ -42,6 +43,8 @@ class BlockingSolver(Solver):
 
     # In seconds. Most methods end within milliseconds when they are closed, a few after thousands of calls.
     grace = 10.0
+    # In seconds, beyond a budget of time that has been spent while the method computes.
+    late_grace = 1.0
 
     def __init__(self, search: Search, *, name: str) -> None:
         super().__init__(search, name=name)
@@ -49,6 +52,7 @@ class BlockingSolver(Solver):
         self._answers: SimpleQueue[Sequence[Evaluation] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
         self._stopping = False
+        self._asking = False
         self._circling = 0
         self._error: BaseException | None = None
         # By the bytes of the place in the unit cube.
@@ -131,7 +135,9 @@ class BlockingSolver(Solver):
             # A daemon thread does not keep a program from ending that forgot to close the solver.
             self._thread = threading.Thread(target=self._run, name=f"solver {self.name}", daemon=True)
             self._thread.start()
+        self._asking = True
         request = self._requests.get()
+        self._asking = False
         if isinstance(request, list):
             return request
         if isinstance(request, BaseException):
@@ -150,7 +156,7 @@ class BlockingSolver(Solver):
         if self._thread is None:
             return
         self._answers.put(None)
-        self._thread.join(self.grace)
+        self._thread.join(self.late_grace if self._asking else self.grace)
         if self._thread.is_alive():
             _log.warning("%s does not return: its thread is left behind", self.name)
         self._requests.put((False, "it was closed"))
