@@ -207,7 +207,7 @@ class ChildProcess:
     def _receive(self, size: int) -> bytes:
         part = self.connection.recv(size)
         if not part:
-            raise ConnectionResetError("its process has ended")
+            raise ConnectionResetError("it closed the connection")
         return part
 
     def wait(self, timeout: float | None = None) -> int:

@@ -134,9 +134,9 @@ def test_page_of_a_simulation_that_hangs_can_be_closed(
     Hanging.begun.clear()
     Hanging.ended.clear()
     release = threading.Timer(30.0, Hanging.ended.set)
+    before = threading.enumerate()
     opened = view(HangingScenario())
-    # It is loaded, so that its threads are those of the program.
-    threads = [thread for thread in threading.enumerate() if thread.name.startswith("vtbdrake")]
+    threads = [thread for thread in threading.enumerate() if thread not in before]
     with page(opened) as socket:
         socket.send(json.dumps({"id": 1, "do": "step"}))
         assert Hanging.begun.wait(PATIENCE)
@@ -148,7 +148,9 @@ def test_page_of_a_simulation_that_hangs_can_be_closed(
     release.cancel()
     Hanging.ended.set()
     for thread in threads:
-        thread.join(PATIENCE)
+        if thread.name.startswith("vtbdrake"):
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
 
 
 def test_foreign_host_and_foreign_origin_are_refused(running: View) -> None:
