@@ -1,4 +1,6 @@
-"""Threads that end the process some time after Ctrl-C, SIGTERM or SIGHUP, or after its parent's end, whatever it computes or waits for.
+"""Threads that end the process some time after a signal, or after its parent's end, whatever it computes or waits for.
+
+The signals are Ctrl-C, SIGTERM and SIGHUP, where Python handles them.
 
 They need no interpreter: code in C or C++ may hold Python's lock all the time, or have dropped the KeyboardInterrupt.
 """
