@@ -1,4 +1,4 @@
-"""What is compiled in: it is compared whenever a context or a vector z is given."""
+"""The values that are compiled in: they are compared whenever a context or a vector z is given."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from vtbdrake.common.argument_checks import as_addresses, as_array, as_flag, as_
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.lru import LruDict
 from vtbdrake.compiled.equations import Timing, UnsupportedTestbedError
+from vtbdrake.compiled.leaf_systems import LeafSystems
 from vtbdrake.compiled.plant import TERRAIN
 from vtbdrake.compiled.program import Program, rollout_function
 from vtbdrake.compiled.schedule import Instant, schedule
@@ -131,7 +132,7 @@ class CompiledRollouts:
         self._workers = workers
         # One thread at a time: CasADi counts the references to its expressions without atomics.
         with making():
-            self.walker = Walker(diagram, context.Clone(), variables, parameters)
+            self.walker = Walker(LeafSystems(diagram, context.Clone(), variables, parameters))
             self._z, self._time = casadi.SX.sym("z", self.walker.vector.size), casadi.SX.sym("time")
             self._w = casadi.SX.sym("w", max(1, self.walker.draws.size))
             recorded, doubt = self._recorded_values()

@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, System
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.compiled_in import CompiledIn
@@ -25,7 +25,6 @@ from vtbdrake.compiled.state_vector import (
     StateVector,
     indices_of,
 )
-from vtbdrake.state import Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
 
 
@@ -46,28 +45,24 @@ class Walker:
         endings: (path, message) of all endings of a simulation, by number from 1 on.
     """
 
-    def __init__(self, diagram: Diagram, context: Context, variables: Variables, varied: Sequence[str]) -> None:
-        """Read a Diagram.
+    def __init__(self, systems: LeafSystems) -> None:
+        """Lay out the vectors z and w of a Diagram.
 
         Args:
-            diagram: The Diagram.
-            context: A root context, with what is compiled in.
-            variables: Its variables.
-            varied: Addresses of variables that will be varied.
+            systems: The leaf systems of the Diagram; their context has what is compiled in.
 
         Raises:
-            UnsupportedTestbedError: Parts of the Diagram cannot be compiled; all are named.
-            ValueError: An address does not exist.
+            UnsupportedTestbedError: A system shows data without updates, and another one ends the simulation.
         """
-        self.systems = LeafSystems(diagram, context, variables, varied)
-        self.vector = StateVector(self.systems)
-        self.draws = Draws(self.systems, self.vector)
-        self.context, self.equations, self.timings = context, self.systems.equations, self.systems.timings
+        self.systems = systems
+        self.vector = StateVector(systems)
+        self.draws = Draws(systems, self.vector)
+        self.context, self.equations, self.timings = systems.context, systems.equations, systems.timings
         self.reasons = [f"the state of {path} is not finite" for path in self.equations]
         self.reasons += [f"{path}: {equations.doubtful}" for path, equations in self.equations.items()]
         self.endings = tuple((path, message) for path, each in self.equations.items() for message in each.endings)
         self._refuse_data_with_endings()
-        self.compiled_in = CompiledIn(self.systems, self.vector)
+        self.compiled_in = CompiledIn(systems, self.vector)
         # The entries of z that must be finite, by path of the system.
         self._finite = {
             path: indices_of(

@@ -56,9 +56,7 @@ class CyclePace(ABC):
         return None
 
     @abstractmethod
-    def wait(
-        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
-    ) -> tuple[float, float] | None:
+    def wait(self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool]) -> tuple[float, float] | None:
         """Wait for the next cycle; return when it was due and how late it is, in seconds, or None if none is to begin.
 
         Args:
@@ -118,9 +116,7 @@ class ClockPace(CyclePace):
         super().__init__(period, clock, statistics)
         self._receive = receive
 
-    def wait(
-        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
-    ) -> tuple[float, float] | None:
+    def wait(self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool]) -> tuple[float, float] | None:
         # Shortly before the deadline, messages that have arrived are received and fed already.
         return deadline, self._clock.wait_until(deadline, self._receive) - deadline
 
@@ -179,9 +175,7 @@ class MessagePace(CyclePace):
     def problem(self) -> str | None:
         return self._monitor.problem or self._monitor.unknown
 
-    def wait(
-        self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool] = lambda: False
-    ) -> tuple[float, float] | None:
+    def wait(self, deadline: float, active: tuple[str, ...], ends: Callable[[], bool]) -> tuple[float, float] | None:
         messages, begin = self.messages, self._clock.now()
         limit, keep_at, tell_at = begin + self._patience, begin + _KEEP_PERIOD, begin + _LONG_WAIT
         while self.messages == messages:

@@ -1,4 +1,4 @@
-"""What a docking camera sees of captures on which it looks on, and the captures that it guides itself."""
+"""The markers and poses that a docking camera sees as it looks on, and the captures that it guides itself."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _BODIES = ("sim.sys.servicer.base", "sim.sys.target.body")
 _MOTION = tuple(f"{body}.{value}" for body in _BODIES for value in ("pose", "velocity"))
 
 GUIDED_HORIZON = 36.0
-"""How long a capture that the camera guides may take, in s."""
+"""The time that a capture may take if the camera guides it, in s."""
 GUIDED_RATE = 2.5
 """The images per second of a camera that guides, in Hz: less than usual, because images are what a capture costs."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a camera sees in some captures.
+    """The markers and the errors of poses that a camera sees in some captures.
 
     Attributes:
         counts: The markers at the sample times after the start, shape (captures, samples).

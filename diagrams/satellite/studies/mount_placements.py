@@ -30,15 +30,15 @@ COUNT = "dps.env.markers.count"
 _EXPOSURE = "sim.sense.docking_camera.exposure"
 
 HORIZON = 24.0
-"""How long the markers count, in s: from the start until the relative motion has stopped."""
+"""The time over which the markers count, in s: from the start until the relative motion has stopped."""
 SAMPLE_PERIOD = 4.0
-"""How often they are counted, in s."""
+"""The time between two counts, in s."""
 TUMBLES = (0.5, 1.0, 1.5, 2.0, 3.0)
 """The tumble rates of the captures, in deg/s: up to the one at which captures must succeed."""
 REACH = 0.45
 """The largest distance from the middle of the face at which the camera's housing fits on it, in m."""
 FOOT_DISTANCE = 0.18
-"""How far the camera stays away from the axis of the arm's foot, in m."""
+"""The least distance of the camera from the axis of the arm's foot, in m."""
 
 # The least place of the camera along x of B, in m: 2 cm before the front face; a bracket reaches 10 cm farther.
 _X = 0.62
@@ -124,7 +124,7 @@ BY_HAND: dict[str, Array] = {
 STILL = "as if the base stood still"
 TURNED = "turned up by the turn of the base"
 RULES = (STILL, TURNED)
-"""How placements by hand are aimed. `TURNED` knows how the base reacts to the arm."""
+"""The rules that aim placements by hand. `TURNED` knows how the base reacts to the arm."""
 
 
 def by_hand(rule: str) -> dict[str, Array]:
