@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -167,9 +168,9 @@ def test_images_come_from_drakes_camera_as_from_the_simulated_one() -> None:
 @pytest.mark.slow
 def test_station_drives_hardware_sim_in_real_time(tmp_path: Path) -> None:
     scenario = ArmStation(f"{FILE}#Position")
-    # A busy computer misses deadlines, and the machine reports late, which is not the question here.
+    # On a busy computer the loop misses deadlines, and the machine is slow and reports late, which is not the question.
     deployment = vtb.Deployment.of(scenario)
-    patient = {**deployment.guards, "max_missed": 10_000, "acting_latency": 250}
+    patient = {**deployment.guards, "max_missed": 10_000, "acting_latency": 250, "pace_tolerance": inf}
     deployment = replace(deployment, guards=patient, check_age=False)
     with (
         vtb.Hub(port=0) as hub,
@@ -178,8 +179,12 @@ def test_station_drives_hardware_sim_in_real_time(tmp_path: Path) -> None:
     ):
         runtime.take_over(timeout=60.0)
         runtime.write({"u.target": HOME + 0.05, "u.opening": 0.08})
-        runtime.run(seconds=3.0)
-        assert runtime.guards.latched == ()
-        np.testing.assert_allclose(runtime.read("real.sense.iiwa_position_measured"), HOME + 0.05, atol=0.01)
-        assert runtime.read("real.sense.wsg_position_measured") == pytest.approx(0.08, abs=0.002)
+        for _ in range(20):
+            runtime.run(seconds=1.5)
+            assert runtime.guards.latched == ()
+            arm, hand = (runtime.read(f"real.sense.{name}_position_measured") for name in ("iiwa", "wsg"))
+            if np.allclose(arm, HOME + 0.05, atol=0.005) and hand == pytest.approx(0.08, abs=0.001):
+                break
+        np.testing.assert_allclose(arm, HOME + 0.05, atol=0.01)
+        assert hand == pytest.approx(0.08, abs=0.002)
     assert vtb.replay(tmp_path / "log").identical
