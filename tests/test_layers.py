@@ -75,7 +75,8 @@ TABLE = "upper_layers"
 
 OUTSIDE = {"vtbdrake_diagrams", "diagrams", "benchmarks", "tests"}
 
-HEAVY = {"matplotlib.pyplot", "pandas", "casadi", "lcm", "tqdm.notebook", "cv2", "optuna", "distributed", "scipy.stats"}
+HEAVY = {"matplotlib.pyplot", "pandas", "casadi", "lcm", "tqdm.notebook", "cv2", "optuna", "distributed"}
+HEAVY |= {f"scipy.{part}" for part in ("linalg", "special", "spatial", "optimize", "interpolate", "stats")}
 
 
 def violations(tree: ast.AST, module: str, is_package: bool = False) -> list[str]:

@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.special import gammaincinv
+import scipy
 
 from vtbdrake.common.arrays import Array, Indices
 
@@ -25,7 +24,7 @@ def chi_square_quantile(probability: float, degrees: int) -> float:
         probability: The probability, in [0, 1].
         degrees: The number of degrees of freedom, at least 1.
     """
-    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
+    return 2.0 * float(scipy.special.gammaincinv(0.5 * degrees, probability))
 
 
 def squared_distances(nu: Array, S: Array) -> Array:
@@ -52,7 +51,7 @@ def one_to_one(gain: Array) -> tuple[Indices, Indices]:
         gain: What each pair of row and column gains, (n, m); pairs that gain nothing are not assigned. With the gate
             less d² as the gain, this is the assignment of the global nearest neighbours.
     """
-    rows, columns = linear_sum_assignment(np.maximum(gain, 0.0), maximize=True)
+    rows, columns = scipy.optimize.linear_sum_assignment(np.maximum(gain, 0.0), maximize=True)
     is_pair = gain[rows, columns] > 0.0
     return rows[is_pair], columns[is_pair]
 

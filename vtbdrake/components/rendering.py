@@ -18,11 +18,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
-from scipy.ndimage import minimum_filter
 
 from vtbdrake.components.environment.light import LIGHT, light_sources
 from vtbdrake.components.shadows import sunlit
@@ -402,7 +402,7 @@ def shade(
         reach: How far away a body may be that throws a shadow, in m.
     """
     # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
-    depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
+    depth = np.where(np.isinf(depth), scipy.ndimage.minimum_filter(depth, 3), depth)
     visible = (color[..., 0] > 0.0) | (color[..., 1] > 0.0) | (color[..., 2] > 0.0)
     bright = np.flatnonzero(visible & np.isfinite(depth) & (depth > 0.0))
     points_C = camera.rays_C.reshape(3, -1)[:, bright] * depth.ravel()[bright]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.parameter import Choice, Dimension
@@ -105,7 +105,7 @@ def _density(cells: Array, count: int) -> Array:
     scott = 1.059 * min((quartiles[1] - quartiles[0]) / 1.34, deviation) * n**-0.2
     centres = np.append(points, (count - 1) / 2.0)[:, np.newaxis]
     widths = np.append(np.full(n, max(scott, _NARROWEST)), count)[:, np.newaxis]
-    below = ndtr((np.arange(count + 1) - 0.5 - centres) / widths)
+    below = scipy.special.ndtr((np.arange(count + 1) - 0.5 - centres) / widths)
     kernels = np.diff(below) / (below[:, -1:] - below[:, :1])
     density: Array = kernels.mean(axis=0)
     return density

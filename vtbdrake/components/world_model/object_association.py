@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
@@ -74,7 +74,7 @@ def mahalanobis(world_object: WorldObject, sighting: Sighting) -> tuple[float, i
             check_units(world_object, name, measured)
             innovations.append(np.array([float(measured.value) - float(expected.value)]))
             covariances.append(np.array([[expected.deviation**2 + measured.deviation**2]]))
-    nu, S = np.concatenate(innovations), block_diag(*covariances)
+    nu, S = np.concatenate(innovations), scipy.linalg.block_diag(*covariances)
     return float(squared_distances(nu, S)), nu.size
 
 

@@ -9,9 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
-from scipy.spatial.distance import cdist
-from scipy.special import boxcox1p, log_ndtr, ndtri
+import scipy
 
 from vtbdrake.optimization.parameter import Choice
 from vtbdrake.optimization.solvers.designs import sobol_units
@@ -211,7 +209,7 @@ class Bayesian(Solver):
             value = np.zeros(len(units)) if improvement is None else improvement(places)
             for model in constraints:
                 mean, deviation = model.predict(places)
-                value = value + log_ndtr(-mean / deviation)
+                value = value + scipy.special.log_ndtr(-mean / deviation)
             return value
 
         return acquisition
@@ -222,7 +220,7 @@ class Bayesian(Solver):
         front = costs[~_domination(costs).any(axis=0)]
         lowest, width = front.min(axis=0), np.ptp(front, axis=0)
         width = np.where(width > 1e-6, width, 1.0)
-        quantiles = ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
+        quantiles = scipy.special.ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
         draws = [self._rng.permutation(quantiles) for _ in models]
 
         def weighed(each: Sequence[np.ndarray]) -> np.ndarray:
@@ -332,14 +330,14 @@ class _Model:
         self._X, self._y = X, y
         K = self._kernel(X)
         K[np.diag_indices_from(K)] += math.exp(self._theta[-1]) + JITTER
-        self._factor = cholesky(K, lower=True, check_finite=False)
-        self._alpha = cho_solve((self._factor, True), y, check_finite=False)
+        self._factor = scipy.linalg.cholesky(K, lower=True, check_finite=False)
+        self._alpha = scipy.linalg.cho_solve((self._factor, True), y, check_finite=False)
 
     def _kernel(self, X: np.ndarray) -> np.ndarray:
         """Return the covariances of the signal at ``X``, shape (k, m), with the points of the fit: (k, points)."""
         assert self._theta is not None
         lengths = np.exp(self._theta[1:-1])
-        r = math.sqrt(5.0) * cdist(X / lengths, self._X / lengths)
+        r = math.sqrt(5.0) * scipy.spatial.distance.cdist(X / lengths, self._X / lengths)
         return np.asarray(math.exp(self._theta[0]) * (1.0 + r + r * r / 3.0) * np.exp(-r))
 
     def believe(self, x: np.ndarray) -> None:
@@ -351,15 +349,13 @@ class _Model:
         """Return mean and standard deviation without the noise, both of shape (k,)."""
         assert self._theta is not None
         K = self._kernel(X)
-        projected = solve_triangular(self._factor, K.T, lower=True, check_finite=False)
+        projected = scipy.linalg.solve_triangular(self._factor, K.T, lower=True, check_finite=False)
         variance = math.exp(self._theta[0]) - np.einsum("ij,ij->j", projected, projected)
         return K @ self._alpha, np.sqrt(np.maximum(variance, 1e-12))
 
 
 def _most_probable(X: np.ndarray, y: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return the logarithms of a kernel's hyperparameters with the largest posterior density, from a start."""
-    from scipy.optimize import minimize
-
     count, lengths = X.shape
     centre = np.log([SIGNAL[0], *[LENGTH[0] * lengths**0.25] * lengths, NOISE[0]])
     width = np.array([SIGNAL[1], *[LENGTH[1]] * lengths, NOISE[1]])
@@ -375,10 +371,10 @@ def _most_probable(X: np.ndarray, y: np.ndarray, start: np.ndarray) -> np.ndarra
         noisy = K.copy()
         noisy[diagonal] += noise + JITTER
         try:
-            factor = cholesky(noisy, lower=True, check_finite=False)
-        except LinAlgError:
+            factor = scipy.linalg.cholesky(noisy, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
             return math.inf, np.zeros_like(theta)
-        inverse = cho_solve((factor, True), np.eye(count), check_finite=False)
+        inverse = scipy.linalg.cho_solve((factor, True), np.eye(count), check_finite=False)
         alpha = inverse @ y
         weights = inverse - np.outer(alpha, alpha)
         slopes = (weights * decay * (1.0 + r)).ravel() @ squares * scales * (5.0 / 3.0)
@@ -388,7 +384,9 @@ def _most_probable(X: np.ndarray, y: np.ndarray, start: np.ndarray) -> np.ndarra
         return value, gradient + z / width
 
     bounds = np.log([SIGNAL_RANGE, *[LENGTH_RANGE] * lengths, NOISE_RANGE])
-    return np.asarray(minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15}).x)
+    return np.asarray(
+        scipy.optimize.minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15}).x
+    )
 
 
 def _expected_improvement(model: _Model, examined: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -406,7 +404,7 @@ def _log_h(z: np.ndarray) -> np.ndarray:
     """Return log(phi(z) + z Phi(z)) of the standard normal distribution; by its asymptote phi(z) / z^2 if tiny."""
     log_phi = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
     near = np.maximum(z, -6.0)
-    exact = np.log(np.exp(-0.5 * near**2) / np.sqrt(2.0 * np.pi) + near * np.exp(log_ndtr(near)))
+    exact = np.log(np.exp(-0.5 * near**2) / np.sqrt(2.0 * np.pi) + near * np.exp(scipy.special.log_ndtr(near)))
     return np.where(z > -6.0, exact, log_phi - 2.0 * np.log(np.maximum(-z, 1.0)))
 
 
@@ -425,7 +423,11 @@ def _normal(costs: np.ndarray) -> np.ndarray:
     # The exponent is the most likely one on a grid, which is then refined.
     exponents = np.linspace(-4.0, 6.0, 51)
     for width in (0.2, 0.0):
-        bent = np.where(x >= 0.0, boxcox1p(x, exponents[:, np.newaxis]), -boxcox1p(-x, 2.0 - exponents[:, np.newaxis]))
+        bent = np.where(
+            x >= 0.0,
+            scipy.special.boxcox1p(x, exponents[:, np.newaxis]),
+            -scipy.special.boxcox1p(-x, 2.0 - exponents[:, np.newaxis]),
+        )
         likelihood = (exponents - 1.0) * (np.sign(x) @ np.log1p(np.abs(x))) - 0.5 * len(x) * np.log(bent.var(axis=1))
         best = int(np.argmax(likelihood))
         exponents = np.linspace(exponents[best] - width, exponents[best] + width, 41)

@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy
 
 from vtbdrake.optimization.solvers.evolution import default_population
 from vtbdrake.optimization.solvers.solver import (
@@ -153,8 +153,8 @@ class Cem(SamplingSolver):
 
     def _draw(self, shape: tuple[int, int]) -> np.ndarray:
         # Truncated, not clipped: many equal points at an end of the range would be elite together.
-        low, high = (ndtr((end - self._mu) / self._sigma) for end in (0.0, 1.0))
-        drawn = self._mu + self._sigma * ndtri(low + (high - low) * self._generator.random(shape))
+        low, high = (scipy.special.ndtr((end - self._mu) / self._sigma) for end in (0.0, 1.0))
+        drawn = self._mu + self._sigma * scipy.special.ndtri(low + (high - low) * self._generator.random(shape))
         return np.clip(drawn, 0.0, 1.0)
 
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
