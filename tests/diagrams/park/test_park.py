@@ -41,6 +41,7 @@ from vtbdrake_diagrams.park.survey import Survey, SurveyConfig, survey
 pytestmark = pytest.mark.one_python
 
 
+@pytest.mark.slow
 def test_simulated_car_finds_itself_and_says_how_well():
     testbed = ParkScenario(seed=1).build()
     context = testbed.default_context()
