@@ -8,6 +8,7 @@ import pytest
 from tests.components.localization.drives import PERIOD, drive, error, nees
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.map_errors import ShownErrors
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import (
@@ -229,6 +230,21 @@ def test_scale_of_the_wheels_is_estimated_and_in_the_covariance():
     assert nees(answers[-1].pose, answers[-1].covariance, one.poses[-1]) < 9.0
     # After a long time without detections, the track is lost.
     assert unit_for(one.map).step(state, scans[-1], X_OH=reckoned[-1], time=1e3)[0].status == LOST
+
+
+def test_errors_of_the_map_that_a_lost_track_has_shown_are_kept():
+    one, unit = drive(3, ACCURATE, reach=18.0), unit_on(3)
+    _, state = run(unit, one.scans, one.reckoned)
+    assert state.track.scatter < 1.2
+    shown = ShownErrors(excess=500.0, freedom=60.0)
+    state = replace(state, track=replace(state.track, gone=shown))
+    later = 1_000_000
+    answer, state = unit.step(state, Landmarks.empty(), X_OH=one.reckoned[-1], time=PERIOD * later)
+    assert answer.status == LOST
+    answers, state = run(unit, one.scans, one.reckoned, state, first=later + 1)
+    assert answers[-1].status == TRACKING and state.track.gone is shown
+    # 512 / 72 = 7.1 counts as much as 12 degrees of freedom that seem right.
+    assert 1.2 < state.track.scatter < 7.1
 
 
 def test_the_memory_survives_as_arrays():

@@ -17,29 +17,23 @@ measured badly. The change d of the pose by a scan has the covariance D, the pos
 So s = dᵀ D⁻¹ d / 3 is 1 on average; the variance of the next motion is multiplied by a factor that follows s (by a
 tenth of its difference from 1 per scan), and that grows fourfold with a scan that fails. It is at least 1.
 
-*Distortion.* A map that is bent, sheared or scaled fits everywhere nearly, and leads astray all the same. It shows in
-the corrections c of the landmarks in the state, their estimates less their positions on the map: on a right map they
-have the covariance M of the map's errors (less what is not known yet), on a distorted one they change with the
-position. With the functions B = [1, x, y], the statistic T = Σ |(Bᵀ M⁻¹ B)^(-1/2) Bᵀ M⁻¹ c|² over both axes is at most
-chi-square distributed with 6 degrees of freedom on a right map. Beyond ``distortion_gate``, the pose is doubtful, and
-far beyond, lost: so large are corrections by wrong matches. Between its 95 % quantile and that, the covariance of the
-pose is multiplied by the ratio of T to the quantile (the ratio of Birge, Physical Review 40, 1932).
-
-*Scatter.* A map may be worse than it says. What B leaves of the corrections, r = |M^(-1/2) c|² - T with k degrees of
-freedom, is then too large: the variances of the map seem s² = (a + r) / (a + k) times as large as told, at least once,
-where a = 12 makes what is told count as much as six landmarks. The priors of further landmarks and the covariance of
-the pose are multiplied by s², and T is divided by it. A landmark that came with too small a variance is held near its
-place on the map, so that s² is too small rather than too large.
+*Map.* `vtbdrake.components.localization.map_errors` says what the landmarks in the state show of the errors of the map.
+Beyond ``distortion_gate``, a distortion T makes the pose doubtful, and far beyond, lost: so large are corrections by
+wrong matches. Between its 95 % quantile and that, the covariance of the pose is multiplied by the ratio of T to the
+quantile (the ratio of Birge, Physical Review 40, 1932). By the scatter s², T is divided, and the priors of further
+landmarks are multiplied. If the landmarks that have left the state show s₀², those in it came with about as much. What
+only these show, s² / s₀², multiplies the covariance of the pose, too: they came with less, and errors that neighbours
+share displace the pose by more than they scatter.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
+from vtbdrake.components.localization import map_errors
 from vtbdrake.components.localization.landmarks import SensorView
 from vtbdrake.components.localization.track_state import TrackState, in_level_frame
 
@@ -73,9 +67,6 @@ _SCALES = np.array([1.0, 1.0, 0.1])
 
 # Degrees of freedom of the distortions: displacement, rotation, scale and shear, which are affine.
 _DISTORTIONS = 6
-
-# Degrees of freedom for which the map's own variances count in the estimate of the scatter.
-_AS_TOLD = 12.0
 
 # Beyond this multiple of the gate of distortions, matches are wrong, and the track is lost.
 _TANGLED = 10.0
@@ -163,35 +154,6 @@ def drift_after(before: TrackState, after: TrackState) -> float:
     return min(max(1.0, before.drift * (1.0 + _FOLLOWS * (min(ratio, _LARGEST_RATIO) - 1.0))), _LARGEST_DRIFT)
 
 
-def distortion(places: Array, corrections: Array, M: Array) -> tuple[float, float]:
-    """Return the statistic of a distorted map, T / s², and the factor s² of its scatter.
-
-    Args:
-        places: The positions of landmarks on the map in m, (n, 2).
-        corrections: Their estimates less these positions in m, (n, 2).
-        M: The covariance of the map's errors per axis in m², (n, n), or its diagonal (n,) if they are independent.
-
-    Returns:
-        T / s² and s², see the module.
-    """
-    around = places - places.mean(axis=0)
-    B = np.column_stack([np.ones(len(places)), around / max(1.0, float(np.abs(around).max()))])
-    if M.ndim == 1:
-        deviations = np.sqrt(M)[:, None]
-        B, corrections = B / deviations, corrections / deviations
-    else:
-        root = np.linalg.cholesky(M)
-        B, corrections = (solve_triangular(root, columns, lower=True) for columns in (B, corrections))
-    Q, R = np.linalg.qr(B)
-    # Landmarks on one line, or fewer than three, show fewer distortions.
-    is_shown = np.abs(np.diagonal(R)) > 1e-6 * np.abs(R).max()
-    along = float(((Q.T @ corrections)[is_shown] ** 2).sum())
-    freedom = 2 * (len(places) - int(is_shown.sum()))
-    rest = float((corrections**2).sum()) - along
-    scatter = max(1.0, (_AS_TOLD + rest) / (_AS_TOLD + freedom))
-    return along / scatter, scatter
-
-
 def is_lost(state: TrackState, *, patience: int, largest_deviation: float, distortion_gate: float) -> bool:
     """Return whether the track is lost, with the settings of a `Tracker`.
 
@@ -218,5 +180,6 @@ def is_doubtful(state: TrackState, *, distortion_gate: float) -> bool:
 
 
 def widening(state: TrackState) -> float:
-    """Return the factor of the covariance of the pose, at least 1: the scatter's, more if the map seems distorted."""
-    return state.scatter * max(1.0, state.distortion / chi_square_quantile(0.95, _DISTORTIONS))
+    """Return the factor of the covariance of the pose, at least 1, by the scatter and the distortion of the map."""
+    worse = max(1.0, state.scatter / map_errors.scatter(state.gone))
+    return worse * max(1.0, state.distortion / chi_square_quantile(0.95, _DISTORTIONS))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array, Indices, immutable
+from vtbdrake.components.localization.map_errors import ShownErrors
 from vtbdrake.components.localization.planar import rotation
 from vtbdrake.components.localization.revision import Revision
 
@@ -40,12 +41,15 @@ class TrackState:
         failures: The number of scans in succession that failed.
         distortion: The test statistic of a distorted map after the last scan that was fused.
         scatter: The factor by which the variance of the map's errors seems larger than the map says, at least 1.
+        gone: The errors of the map that landmarks showed which have left x; a new track goes on from there.
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
         unjudged: Numbers of detections and of matched ones, of landmarks that should be seen again and of seen ones,
             of the map's landmarks in plain view and of matched ones, in the last scans, which together had too few to
             be judged, shape (3, 2).
         travelled: The distance travelled by dead reckoning since the start of the track, in m.
         seen_at: That distance at the last fused detection of each landmark in x, shape (n,) in m; -inf before.
+        factors: The variance of each landmark when it entered x, in units of the map's, by the scatter and the doubt of
+            its match, shape (n,); 1 if the map lacks it.
         revision: What the drive has shown of the landmarks, if the map is revised.
 
     From ``evidence`` to ``unjudged``, they are the health of the track, see `vtbdrake.components.localization.health`.
@@ -59,10 +63,12 @@ class TrackState:
     failures: int = 0
     distortion: float = 0.0
     scatter: float = 1.0
+    gone: ShownErrors = field(default_factory=ShownErrors)
     drift: float = 1.0
     unjudged: Array = field(default_factory=lambda: np.zeros((3, 2)))
     travelled: float = 0.0
     seen_at: Array = field(default_factory=lambda: np.zeros(0))
+    factors: Array = field(default_factory=lambda: np.zeros(0))
     revision: Revision = field(default_factory=Revision.none)
 
     @classmethod
@@ -125,6 +131,7 @@ class TrackState:
             indices=self.indices[~mask],
             is_recent=self.is_recent[~mask],
             seen_at=self.seen_at[~mask],
+            factors=self.factors[~mask],
         )
 
 

@@ -83,9 +83,10 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
-from vtbdrake.components.localization import health
+from vtbdrake.components.localization import health, map_errors
 from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
 from vtbdrake.components.localization.landmarks import Landmarks, SensorView
+from vtbdrake.components.localization.map_errors import ShownErrors
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.revision import MapChanges, is_in_plain_view, places_of
 from vtbdrake.components.localization.track_state import (
@@ -274,7 +275,12 @@ class Tracker:
         object.__setattr__(self, "_association", association)
 
     def start(
-        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | SensorView | None = None
+        self,
+        X_WH: ArrayLike,
+        covariance: ArrayLike,
+        landmarks: Landmarks | SensorView | None = None,
+        *,
+        before: ShownErrors | None = None,
     ) -> tuple[TrackState, Matches]:
         """Return the state at a first pose, and the matches of what is seen there.
 
@@ -285,14 +291,16 @@ class Tracker:
             X_WH: The pose, shape (3,).
             covariance: The covariance of the pose, shape (3, 3).
             landmarks: Detections in H at that pose; None starts with the given covariance.
+            before: The errors of the map that an earlier track has shown, its `TrackState.gone`; none by default.
         """
+        gone = ShownErrors() if before is None else before
         pose = np.array(X_WH, dtype=float)
-        state = self._at(pose, np.array(covariance, dtype=float))
+        state = self._at(pose, np.array(covariance, dtype=float), gone)
         if landmarks is None:
             return state, _NO_MATCHES
         view = self._widened(landmarks)
         matches = self._associate(state, view).first(self.most)
-        loose = self._at(pose, np.diag(_LOOSE**2))
+        loose = self._at(pose, np.diag(_LOOSE**2), gone)
         return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), view, matches)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, extent: float) -> TrackState:
@@ -417,13 +425,16 @@ class Tracker:
         view = SensorView.of(landmarks)
         return replace(view, landmarks=view.landmarks.widened(self.least_deviation))
 
-    def _at(self, X_WH: Array, covariance: Array) -> TrackState:
+    def _at(self, X_WH: Array, covariance: Array, gone: ShownErrors) -> TrackState:
         lasting = [self.bias_deviation, self.odometry_deviation, self.rate_deviation]
         # An error that is none needs no place in x.
         lasting += [self.turn_deviation] * (self.turn_deviation > 0.0)
         P = block_diag(covariance, np.diag(lasting) ** 2)
         mean = np.concatenate([X_WH, np.zeros(len(lasting))])
-        return replace(TrackState.none(), mean=mean, covariance=P, evidence=self.first_credit)
+        scatter = map_errors.scatter(gone)
+        return replace(
+            TrackState.none(), mean=mean, covariance=P, evidence=self.first_credit, scatter=scatter, gone=gone
+        )
 
     def _extended(self, state: TrackState, indices: Indices, probability: Array | None = None) -> TrackState:
         """Return the state with further landmarks of the map, (m,), which it does not have yet.
@@ -435,7 +446,8 @@ class Tracker:
         """
         places, variances = self.landmarks.positions, self.landmarks.covariances
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
-        factor = np.ones(m) if probability is None else _variance_within(self.first_gate) * probability**-2.0
+        doubt = np.ones(m) if probability is None else probability**-2.0
+        factor = doubt if probability is None else _variance_within(self.first_gate) * doubt
         if self.correlation == 0.0:
             prior = block_diag(np.zeros((0, 0)), *((state.scatter * factor)[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
@@ -460,6 +472,7 @@ class Tracker:
             indices=np.concatenate([state.indices, indices]),
             is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
             seen_at=np.concatenate([state.seen_at, np.full(m, -inf)]),
+            factors=np.concatenate([state.factors, state.scatter * doubt]),
         )
 
     def _map_errors(self, indices: Indices) -> Array:
@@ -544,15 +557,33 @@ class Tracker:
         distance = np.hypot(*(fused.landmark_positions - mean[:2]).T)
         far = distance > self.horizon
         far[np.argsort(distance)[self.most :]] = True
-        near = fused.without(far)
-        is_mapped = self._is_mapped(near.indices)
-        mapped = near.indices[is_mapped]
-        if not len(mapped):
-            return near, Matches(pairs, nis, is_fused=True)
-        places = self.landmarks.positions[mapped]
-        M = self._map_errors(mapped)
-        distortion, scatter = health.distortion(places, near.landmark_positions[is_mapped] - places, M)
-        return replace(near, distortion=distortion, scatter=scatter), Matches(pairs, nis, is_fused=True)
+        return self._with_shown_errors(fused, fused.without(far)), Matches(pairs, nis, is_fused=True)
+
+    def _with_shown_errors(self, fused: TrackState, near: TrackState) -> TrackState:
+        """Return the state ``near`` with what it shows of the map's errors; ``fused`` also has the landmarks behind."""
+        shown = self._shown_errors(near)
+        gone = near.gone
+        if len(near.indices) < len(fused.indices):
+            whole = self._shown_errors(fused)
+            freedom = max(0.0, gone.freedom + whole.freedom - shown.freedom)
+            gone = ShownErrors(excess=gone.excess + whole.excess - shown.excess, freedom=freedom)
+        scatter = map_errors.scatter(shown, map_errors.scatter(gone))
+        return replace(near, distortion=shown.distortion / scatter, scatter=scatter, gone=gone)
+
+    def _shown_errors(self, state: TrackState) -> ShownErrors:
+        """Return the errors of the map that the landmarks in a state show."""
+        rows = np.flatnonzero(self._is_mapped(state.indices))
+        if not len(rows):
+            return ShownErrors()
+        mapped = state.indices[rows]
+        places, columns = self.landmarks.positions[mapped], state.landmark_columns(rows).ravel()
+        return map_errors.shown_errors(
+            places,
+            state.landmark_positions[rows] - places,
+            self._map_errors(mapped),
+            state.covariance[np.ix_(columns, columns)],
+            _variance_within(self.first_gate) * state.factors[rows],
+        )
 
     def _repeated(self, state: TrackState, rows: Indices) -> Array:
         """Return 2 w ρ / (1 - ρ), by which multiple of themselves the variances of detections grow, (m,).
@@ -649,6 +680,7 @@ class Tracker:
             indices=np.concatenate([state.indices, identities]),
             is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
             seen_at=np.concatenate([state.seen_at, np.full(m, state.travelled)]),
+            factors=np.concatenate([state.factors, np.ones(m)]),
         )
         return replace(begun, revision=revision)
 

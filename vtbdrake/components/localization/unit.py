@@ -93,7 +93,7 @@ class UnitState:
 
     Attributes:
         answer: The last answer.
-        track: The state of the tracker; `TrackState.none` without a pose.
+        track: The state of the tracker; without a pose, `TrackState.none` with what is known of the map.
         submap: The landmarks gathered since there was a pose, or since the start; empty while there is one.
         tried_at: Distance travelled in m and time in s at the last attempt of global localization, shape (2,).
         ignored: The number of calls that were ignored, see `LocalizationUnit.step`.
@@ -198,7 +198,8 @@ class LocalizationUnit:
                 # What was seen in doubt is of the same place.
                 lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=_count(views))
                 submap = self._gathered(state.submap, views, pose, C)
-                return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
+                none = replace(TrackState.none(), gone=track.gone)
+                return lost, UnitState(lost, none, submap, ignored=state.ignored, losses=state.losses + 1)
             if is_doubtful:
                 answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=_count(views))
                 submap = self._gathered(state.submap, views, pose, C)
@@ -225,7 +226,8 @@ class LocalizationUnit:
             return none, state
         # The sensor that sees most begins the track.
         most = max(views, key=lambda view: len(view.landmarks), default=SensorView(Landmarks.empty()))
-        track, matches = self.tracker.start(fix.pose, fix.covariance, gathered if self.begins_with_submap else most)
+        seen = gathered if self.begins_with_submap else most
+        track, matches = self.tracker.start(fix.pose, fix.covariance, seen, before=state.track.gone)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
         answer = self._answer(track, [matches], _count(views), X_OH, time)
