@@ -10,7 +10,9 @@ from vtbdrake.optimization.solvers.solver import Search, SolverError
 # The most calls of a search without a budget.
 LIMIT = 5_000
 # The least number of points that a model interpolates, unless 2 n + 1 are fewer.
-POINTS = 8
+LEAST_POINTS = 8
+# The largest number of points that a model interpolates, unless n + 2 are more.
+MOST_POINTS = 16
 
 
 class Cobyqa(BlockingSolver):
@@ -20,8 +22,9 @@ class Cobyqa(BlockingSolver):
     models. COBYLA has linear ones, with which it follows a curved constraint in small steps only. It asks for one point
     at a time, and ends, with success, when the trust region has shrunk to ``tolerance``.
 
-    A model interpolates n + 2 points, and at least 8 or 2 n + 1. The package's 2 n + 1 would spend most of a small
-    budget on the first model; n + 2 are the fewest with which a model has some curvature.
+    A model interpolates 1 + 3 n / 2 points, rounded down: at least 8, unless 2 n + 1 are fewer, and at most 16, unless
+    n + 2 are more. The package's 2 n + 1, which tell the curvature along each axis, would spend most of a small budget
+    on the first model; with n + 2, the fewest that tell some curvature, it creeps in ill-conditioned valleys.
 
     Args:
         search: Continuous parameters, one objective.
@@ -49,6 +52,7 @@ class Cobyqa(BlockingSolver):
         from scipy.optimize import Bounds, NonlinearConstraint
 
         size, lower = self.search.size, np.zeros(self.search.size)
+        points = max(size + 2, min(2 * size + 1, LEAST_POINTS), min(3 * size // 2 + 1, MOST_POINTS))
         constraint = NonlinearConstraint(self._callback(lambda u: self._at(u)[2]), -np.inf, 0.0)
         result = minimize(
             self._callback(lambda u: self._at(u)[1]),
@@ -59,7 +63,7 @@ class Cobyqa(BlockingSolver):
                 "radius_init": self._radius,
                 "radius_final": self._tolerance,
                 "maxfev": self.search.budget or LIMIT,
-                "nb_points": max(size + 2, min(2 * size + 1, POINTS)),
+                "nb_points": points,
             },
         )
         return bool(result.success), str(result.message)
