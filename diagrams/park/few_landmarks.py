@@ -7,7 +7,7 @@ their detections are left, and a tenth of all others, which show nothing on the 
 without a guess. The survey, which uses all detections together, also later ones, judges each claim, but for the places
 where it contradicts the wheels (`judging`).
 
-The unit was developed with the draws 0 to 2, and with what the draws 3, 17 and 20 showed; the others judge.
+The unit was developed with the draws 0 to 2, and with what the draws 3, 17, 20 and 31 showed; the others judge.
 """
 
 from __future__ import annotations
