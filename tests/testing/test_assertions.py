@@ -96,6 +96,22 @@ def test_assertion_without_content_is_an_error() -> None:
         assert_bounded(ramp(), "z", upper=1.0)
 
 
+@pytest.mark.parametrize("wrong", [np.zeros(3), np.zeros((1, 2)), np.zeros(101), "0.5", [[0.0], [0.0, 1.0]]])
+def test_a_bound_of_another_shape_is_refused(wrong: Any) -> None:
+    trace = ramp()
+    assert trace["x"].shape == (101,) and trace["y"].shape == (101, 2)
+    for name, check in {
+        "lower of y": partial(assert_bounded, trace, "y", lower=wrong),
+        "upper of x": partial(assert_bounded, trace, "x", upper=wrong),
+        "to of y": partial(assert_settles, trace, "y", to=wrong, within=0.0, tolerance=1.0),
+        "tolerance of y": partial(assert_settles, trace, "y", to=0.0, within=0.0, tolerance=wrong),
+    }.items():
+        with pytest.raises(ValueError, match=rf"{name} (has the shape .* is expected|must be a number or several)"):
+            check()
+    with pytest.raises(ValueError, match="tolerance of y (has the shape|must be a number)"):
+        assert_same_motion(trace, trace, "y", tolerance={"y": wrong})
+
+
 # -- settles
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.campaigns.results import least_rate
-from vtbdrake.common.argument_checks import as_addresses
+from vtbdrake.common.argument_checks import as_addresses, as_array
 from vtbdrake.common.failures import error_text
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import QUANTITIES, LoopStatistics
@@ -45,19 +45,19 @@ def assert_bounded(
 
     Raises:
         AssertionError: It leaves its bounds.
-        ValueError: There are no bounds, or there is no sample.
+        ValueError: There are no bounds, or of another shape, or there is no sample.
     """
     __tracebackhide__ = True
-    if np.all(np.equal(lower, -inf)) and np.all(np.equal(upper, inf)):
-        raise ValueError(f"give lower= or upper= of {address}: nothing is asserted without bounds")
     trace = trace_of(source, address)
     values = trace[address]
     asserted = _from(trace, address, after)
-    wrong = ~((values >= np.asarray(lower)) & (values <= np.asarray(upper)))
-    place = _first(wrong, asserted)
+    lows, highs = _each(f"lower of {address}", lower, values), _each(f"upper of {address}", upper, values)
+    if (lows == -inf).all() and (highs == inf).all():
+        raise ValueError(f"give lower= or upper= of {address}: nothing is asserted without bounds")
+    place = _first(~((values >= lows) & (values <= highs)), asserted)
     if place is None:
         return
-    value, (low, high) = values[place], (_entry(bound, values, place) for bound in (lower, upper))
+    value, low, high = values[place], float(lows[place[1:]]), float(highs[place[1:]])
     limit = f"at least {low:.6g}" if value < low else f"at most {high:.6g}" if value > high else "a number"
     fail(
         f"{_named(address, place)} leaves its bounds at {_when(trace, place)}: {value:.6g}{_unit(trace, address)} "
@@ -79,17 +79,17 @@ def assert_settles(source: Source, address: str, *, to: ArrayLike, within: float
 
     Raises:
         AssertionError: It is elsewhere at some later time.
-        ValueError: The source ends before.
+        ValueError: The source ends before, or target or tolerance have another shape.
     """
     __tracebackhide__ = True
     trace = trace_of(source, address)
     values = trace[address]
     asserted = _from(trace, address, within)
-    wrong = ~(np.abs(values - np.asarray(to)) <= np.asarray(tolerance))
-    place = _first(wrong, asserted)
+    targets, margins = _each(f"to of {address}", to, values), _each(f"tolerance of {address}", tolerance, values)
+    place = _first(~(np.abs(values - targets) <= margins), asserted)
     if place is None:
         return
-    target, margin = _entry(to, values, place), _entry(tolerance, values, place)
+    target, margin = float(targets[place[1:]]), float(margins[place[1:]])
     fail(
         f"{_named(address, place)} has not settled at {_when(trace, place)}: {values[place]:.6g}"
         f"{_unit(trace, address)} instead of {target:.6g} +- {margin:.6g} from {within:g} s on",
@@ -160,7 +160,8 @@ def assert_same_motion(
         if a.shape != b.shape:
             raise TraceError(f"{address} has the shape {a.shape[1:]} in one motion, and {b.shape[1:]} in the other")
         allowed = tolerance.get(address, 0.0) if isinstance(tolerance, Mapping) else tolerance
-        same = (np.abs(a - b) <= np.asarray(allowed)) | (a == b) | (np.isnan(a) & np.isnan(b))
+        allowed = _each(f"tolerance of {address}", allowed, a)
+        same = (np.abs(a - b) <= allowed) | (a == b) | (np.isnan(a) & np.isnan(b))
         if (place := _first(~same, np.ones(count, bool))) is not None:
             firsts.append((place, address))
     if firsts:
@@ -407,8 +408,23 @@ def _first(wrong: np.ndarray, asserted: np.ndarray) -> tuple[int, ...] | None:
     return tuple(place[0].tolist()) if len(place) else None
 
 
-def _entry(bound: ArrayLike, values: np.ndarray, place: tuple[int, ...]) -> float:
-    return float(np.broadcast_to(bound, values.shape[1:])[place[1:]])
+def _each(name: str, bound: ArrayLike, values: np.ndarray) -> np.ndarray:
+    """Return a number, or an array, as one number for each entry of a value, in its shape.
+
+    Args:
+        name: The argument's name, for the error message.
+        bound: The number or the array.
+        values: The samples of the value; the first axis is time.
+
+    Raises:
+        ValueError: It has no number for each entry.
+    """
+    numbers, shape = as_array(name, bound), values.shape[1:]
+    try:
+        return np.broadcast_to(numbers, shape)
+    except ValueError:
+        each = f"a number, or an array of its shape {shape}" if shape else "a number"
+        raise ValueError(f"{name} has the shape {numbers.shape}; {each} is expected") from None
 
 
 def _named(address: str, place: tuple[int, ...]) -> str:
