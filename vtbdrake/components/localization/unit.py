@@ -226,8 +226,8 @@ class LocalizationUnit:
             return none, state
         # The sensor that sees most begins the track.
         most = max(views, key=lambda view: len(view.landmarks), default=SensorView(Landmarks.empty()))
-        seen = gathered if self.begins_with_submap else most
-        track, matches = self.tracker.start(fix.pose, fix.covariance, seen, before=state.track.gone)
+        landmarks = gathered if self.begins_with_submap else most
+        track, matches = self.tracker.start(fix.pose, fix.covariance, landmarks, before=state.track.gone)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
         answer = self._answer(track, [matches], _count(views), X_OH, time)
