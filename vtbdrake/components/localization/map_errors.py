@@ -71,6 +71,7 @@ def shown_errors(places: Array, corrections: Array, M: Array, P: Array, factors:
         S = _both_sides(root, deviations[:, None] * M * deviations)
     for axis in range(2):
         left = _both_sides(root, P[axis::2, axis::2])
+        # What the detections leave unknown, 1 - K = P S⁻¹.
         unknown = left / factors if M.ndim == 1 else np.linalg.solve(S, left).T.astype(float)
         K = np.eye(len(places)) - unknown
         KS = S - left
