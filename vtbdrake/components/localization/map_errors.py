@@ -1,4 +1,4 @@
-"""What the landmarks of a track show of the errors of their map: whether it is distorted, or worse than it says.
+"""The errors of a map that the landmarks of a track show: whether it is distorted, or worse than it says.
 
 They show it by their corrections c, the estimates less the positions on the map, per axis in units in which the
 covariance M of the map's errors is 1. Let S be the covariance with which the landmarks entered the state, and P the one
@@ -34,7 +34,7 @@ _AS_TOLD = 12.0
 
 @immutable
 class ShownErrors:
-    """What landmarks show of the errors of their map.
+    """The errors of a map that its landmarks show.
 
     Attributes:
         distortion: The statistic T.

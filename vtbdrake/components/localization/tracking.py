@@ -455,7 +455,7 @@ class Tracker:
             is_mapped = self._is_mapped(state.indices)
             mapped = state.indices[is_mapped]
             k = len(mapped)
-            M = self._map_errors(np.concatenate([mapped, indices]))
+            M = self._map_covariance(np.concatenate([mapped, indices]))
             weights = np.linalg.solve(M[:k, :k], M[:k, k:])
             rest = M[k:, k:] - M[k:, :k] @ weights
             if probability is not None:
@@ -475,7 +475,7 @@ class Tracker:
             factors=np.concatenate([state.factors, state.scatter * doubt]),
         )
 
-    def _map_errors(self, indices: Indices) -> Array:
+    def _map_covariance(self, indices: Indices) -> Array:
         """Return M of the errors of landmarks on the map, (m, m) in m²; (m,) if they are independent."""
         variances = np.maximum(np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2) / 2.0, 1e-6)
         if self.correlation == 0.0:
@@ -580,7 +580,7 @@ class Tracker:
         return map_errors.shown_errors(
             places,
             state.landmark_positions[rows] - places,
-            self._map_errors(mapped),
+            self._map_covariance(mapped),
             state.covariance[np.ix_(columns, columns)],
             _variance_within(self.first_gate) * state.factors[rows],
         )
